@@ -8,7 +8,7 @@ from typing import Any
 from ..files.choices import cpu_threads
 from ..files.writing import same_file, write_atomically
 from ..policy.foreign.adapters import assumptions
-from ..studies.doctor.alternatives import toml_lines
+from ..policy.foreign.described import toml_lines
 from ..studies.doctor.diagnosis import Diagnosis, Outcome, diagnose
 from .console import Terminal, make_table, print_json
 from .errors import UserError

@@ -5,10 +5,12 @@ from __future__ import annotations
 import hashlib
 import logging
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ..files.parsing import shown
 from ..robots import Robot, load_robot
 from .base import PolicyError
 from .contract import ContractError, HistoryOrder, PolicyContract, check_robot, standard_contract
@@ -19,16 +21,17 @@ from .foreign.adapters import (
     checkpoint_network,
     contract_for_width,
     deploy_contract,
-    described_contract,
     find_deploy_file,
     mjlab_contract,
     sidecar_contract,
 )
+from .foreign.described import described_contract
 from .foreign.fence.archive import archive_names, read_limited
 from .native import FilePolicy, ForeignFile, NativePolicy, StoredNetwork, is_policy, load_entries, read_policy
 
 if TYPE_CHECKING:
     from .foreign.fence.child import Child
+    from .foreign.fenced_policy import Started
 
 DEFAULT_ROBOT = "go2"
 
@@ -105,40 +108,59 @@ def _load(
                 "add --trust (in Python trust=True) to run it, in a process of its own"
             )
         return _foreign(network, path, source, robot, contract=inside)
-    found = checkpoint_network(entries, robot, path=path)
+    found = checkpoint_network(entries, robot, path=path, contract=contract)
     if found is None:
         raise PolicyError(f"'{source}' is a torch.save file, but neither a gaitgauge policy nor an rsl_rl checkpoint")
-    assumed, network = found
-    return NativePolicy(contract or assumed, network, path=source)
+    described, network = found
+    return NativePolicy(described, network, path=source)
 
 
 def _foreign(
     file: ForeignFile, path: Path, source: str, robot: Robot, *, contract: PolicyContract | None = None
 ) -> FilePolicy:
-    """Load a TorchScript or ONNX file; ``contract`` is the one that was stored with it, None to look for one."""
-    # Only those who load such a file wait for what it needs.
-    from .foreign.fence.child import Child
-    from .foreign.fenced_policy import FencedPolicy
+    """Load a TorchScript or ONNX file; ``contract`` is the one that was stored with it or given, None to look for one."""
+    from .foreign.fenced_policy import FencedPolicy  # only those who load such a file wait for what it needs
 
-    metadata: dict[str, str] = {}
+    file, program, metadata = _start(file, source, path.parent)
+    contract = contract or _foreign_contract(program.child, file.kind, metadata, path, source, robot)
+    encoder = None
+    if contract.encoder is not None:
+        inner = file.encoder or _beside(path, contract.encoder.file, source)
+        inner, encoder, _ = _start(inner, contract.encoder.file, path.parent)
+        file = replace(file, encoder=inner)
+    return FencedPolicy(file, program, contract, path=source, encoder=encoder)
+
+
+def _beside(path: Path, name: str, source: str) -> ForeignFile:
+    """Return the encoder's file, which lies beside the policy's."""
+    beside = path.with_name(Path(name).name)
+    if Path(name).name != name or not beside.is_file():
+        raise PolicyError(f"'{source}' lacks its encoder: there is no file {shown(name)} beside it")
+    data = read_limited(beside)
+    return ForeignFile(kind=file_kind(data, str(beside)), data=data)
+
+
+def _start(file: ForeignFile, source: str, folder: Path) -> tuple[ForeignFile, Started, dict[str, str]]:
+    """Start a program's process; return the file with all of its weights, the process, and what the file says of itself."""
+    from .foreign.fence.child import Child
+    from .foreign.fenced_policy import Started
+
     if file.kind == "torchscript":
         from .foreign.fence.script import check_script
         from .foreign.torchscript_session import ScriptProgram
 
         script = check_script(file.data, source=source)
-        child, attributes = Child(ScriptProgram, script.data, source=source), script.attributes
-        if script.contract:
-            metadata["contract"] = script.contract
-    else:
-        from .foreign.fence.graph import check_graph
-        from .foreign.onnx_session import GraphProgram  # with onnxruntime, which the forked child may not load any more
+        started = Started(child=Child(ScriptProgram, script.data, source=source), attributes=script.attributes)
+        return file, started, {"contract": script.contract} if script.contract else {}
+    if file.kind != "onnx":
+        raise PolicyError(f"'{source}' is neither TorchScript nor ONNX; an encoder has to be one of them")
+    from .foreign.fence.graph import check_graph
+    from .foreign.onnx_session import GraphProgram  # with onnxruntime, which the forked child may not load any more
 
-        model = check_graph(file.data, source=source, folder=path.parent)
-        metadata = {entry.key: entry.value for entry in model.metadata_props}
-        file = ForeignFile(kind=file.kind, data=model.SerializeToString())
-        child, attributes = Child(GraphProgram, file.data, source=source), frozenset()
-    contract = contract or _foreign_contract(child, file.kind, metadata, path, source, robot)
-    return FencedPolicy(file, child, contract, path=source, attributes=attributes)
+    model = check_graph(file.data, source=source, folder=folder)
+    metadata = {entry.key: entry.value for entry in model.metadata_props}
+    file = replace(file, data=model.SerializeToString())
+    return file, Started(child=Child(GraphProgram, file.data, source=source), attributes=()), metadata
 
 
 def _foreign_contract(

@@ -27,7 +27,7 @@ import pickle
 import re
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -78,6 +78,13 @@ class ForeignFile:
     kind: str
     """``torchscript`` or ``onnx``."""
     data: bytes
+    encoder: ForeignFile | None = None
+    """The network that runs first, where the contract has an ``encoder``."""
+
+    def entries(self) -> dict[str, Any]:
+        """Return what a policy file says of it."""
+        data = torch.frombuffer(bytearray(self.data), dtype=torch.uint8)
+        return {"kind": self.kind, "bytes": data} | ({"encoder": self.encoder.entries()} if self.encoder else {})
 
 
 def first_line(error: BaseException) -> str:
@@ -119,8 +126,7 @@ def policy_entries(contract: PolicyContract, network: StoredNetwork | ForeignFil
         described = {"kind": "native", "architecture": network.architecture, "arguments": arguments}
         state = {name: value.detach().to("cpu") for name, value in network.state_dict.items()}
         return entries | {"network": described, "state_dict": state}
-    data = torch.frombuffer(bytearray(network.data), dtype=torch.uint8)
-    return entries | {"network": {"kind": network.kind, "bytes": data}}
+    return entries | {"network": network.entries()}
 
 
 def checksum(entries: Mapping[str, Any]) -> str:
@@ -178,10 +184,8 @@ def read_policy(entries: Mapping[str, Any], *, source: str) -> tuple[PolicyContr
         raise PolicyError(f"'{source}' has a malformed contract: {error}") from error
     kind = spec.get("kind")
     if isinstance(kind, str) and kind in FOREIGN_KINDS:
-        data = spec.get("bytes")
-        if not isinstance(data, torch.Tensor) or data.dtype != torch.uint8:
-            raise PolicyError(f"'{source}' says that it carries a {kind} file, but has none")
-        return contract, ForeignFile(kind=kind, data=data.numpy().tobytes())
+        encoder = _carried(inner, source) if isinstance(inner := spec.get("encoder"), Mapping) else None
+        return contract, replace(_carried(spec, source), encoder=encoder)
     if not isinstance(kind, str) or kind != "native":
         raise PolicyError(f"'{source}' has a network of unknown kind {shown(kind)}")
     state_dict = entries.get("state_dict")
@@ -198,6 +202,14 @@ def read_policy(entries: Mapping[str, Any], *, source: str) -> tuple[PolicyContr
         raise PolicyError(f"'{source}' has malformed network arguments: {first_line(error)}") from error
     architecture = str(spec.get("architecture"))
     return contract, StoredNetwork(architecture=architecture, arguments=arguments, state_dict=state_dict)
+
+
+def _carried(spec: Mapping[str, Any], source: str) -> ForeignFile:
+    """Return the foreign file that a policy file carries."""
+    kind, data = spec.get("kind"), spec.get("bytes")
+    if kind not in FOREIGN_KINDS or not isinstance(data, torch.Tensor) or data.dtype != torch.uint8:
+        raise PolicyError(f"'{source}' says that it carries a {shown(kind)} file, but has none")
+    return ForeignFile(kind=str(kind), data=data.numpy().tobytes())
 
 
 def _intact(entries: Mapping[str, Any]) -> bool:
@@ -303,8 +315,10 @@ class FilePolicy(Policy):
         """
         total, stored = hashlib.sha256(self.contract.hash.encode()), self.stored
         if isinstance(stored, ForeignFile):
-            total.update(stored.kind.encode())
-            total.update(stored.data)
+            for file in (stored, stored.encoder):
+                if file is not None:
+                    total.update(file.kind.encode())
+                    total.update(file.data)
             return total.hexdigest()
         total.update(json.dumps([stored.architecture, dict(stored.arguments)], sort_keys=True).encode())
         for name, tensor in sorted(stored.state_dict.items()):

@@ -13,7 +13,7 @@ from typing import Any
 
 import torch
 
-from ...files.parsing import parse_toml, parse_yaml, read_text
+from ...files.parsing import parse_yaml, read_text
 from ...robots.base import Robot
 from ..base import PolicyError
 from ..contract import (
@@ -22,7 +22,6 @@ from ..contract import (
     HistoryOrder,
     ObservationTerm,
     PolicyContract,
-    reordered,
     standard_contract,
 )
 from ..native import StoredNetwork
@@ -31,6 +30,8 @@ from ..observation_table import ObservationError, foreign_observation
 AT_ONCE = 1.0
 """Time after standing within which a fall says that the policy is run wrongly [s]."""
 LONGEST_HISTORY = 20
+GUESSES = ("ONNX", "TorchScript", "rsl_rl checkpoint")
+"""Adapters that take the whole observation for granted."""
 
 
 def sidecar_contract(path: Path) -> PolicyContract | None:
@@ -44,26 +45,6 @@ def sidecar_contract(path: Path) -> PolicyContract | None:
     return None
 
 
-def described_contract(path: Path, robot: Robot) -> PolicyContract:
-    """Read a ``contract.toml``: fields of ``PolicyContract``; fields left out are the robot's standard ones. Where
-    it lists the joints in an order of its own, standard values per joint go with their joints.
-
-    Raises:
-        PolicyError: no such file, or a field is unknown or malformed.
-    """
-    source = f"contract file '{path}'"
-    data = parse_toml(read_text(path, "contract file", PolicyError), source, PolicyError)
-    provenance = {"adapter": "contract.toml", "file": path.name}
-    standard = standard_contract(robot, provenance=provenance)
-    names = data.get("joint_names")
-    if isinstance(names, list) and len(names) == robot.num_joints and all(n in names for n in robot.joint_names):
-        standard = reordered(standard, names)
-    try:
-        return PolicyContract.from_dict({**standard.to_dict(), **data})
-    except ContractError as error:
-        raise PolicyError(f"{source} is wrong: {error}") from error
-
-
 def contract_for_width(
     width: int, robot: Robot, *, order: HistoryOrder, provenance: Mapping[str, Any], source: str
 ) -> PolicyContract:
@@ -73,7 +54,7 @@ def contract_for_width(
     if rest or not 1 <= frames <= LONGEST_HISTORY:
         raise PolicyError(
             f"'{source}' takes {width} values, which is no multiple of the standard observation's {frame}; "
-            "put a contract.json beside it that describes its observation"
+            "give a contract.toml that describes its observation (gaitgauge contract new)"
         )
     history = History(length=frames, order=order if frames > 1 else "frame-major")
     assumed = f"{frames} frame(s) of the standard observation of {frame} entries, {history.order}; gains of the robot"
@@ -81,9 +62,11 @@ def contract_for_width(
 
 
 def assumptions(contract: PolicyContract) -> str | None:
-    """Return the assumptions about a policy that lacks a contract, as one sentence; None where there are none."""
+    """Return the assumptions about a policy that lacks a contract, or parts of one, as one sentence; None where there are none."""
     if "assumed" not in contract.provenance:
         return None
+    if contract.provenance["adapter"] not in GUESSES:
+        return f"assumed, since '{contract.provenance.get('file', 'its description')}' does not say: {contract.provenance['assumed']}"
     scales = ", ".join(f"{t.name} × {', '.join(f'{s:g}' for s in t.scale)}" for t in contract.observation)
     joints = ", ".join(name.removesuffix("_joint") for name in contract.joint_names)
     gains = " and ".join(
@@ -98,8 +81,8 @@ def assumptions(contract: PolicyContract) -> str | None:
     )
     return (
         f"taken for granted ({contract.provenance['assumed']}): history {frames}; joints {joints}; observation {scales}; "
-        f"action scale {min(contract.action_scale):g} rad, gains {gains}; where this is wrong the robot falls: put a "
-        "contract.json or deploy.yaml beside the file that says it"
+        f"action scale {min(contract.action_scale):g} rad, gains {gains}; where this is wrong the robot falls: "
+        "give a description with --contract, or put a contract.toml or deploy.yaml beside the file"
     )
 
 

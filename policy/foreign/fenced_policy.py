@@ -5,6 +5,8 @@ from __future__ import annotations
 import functools
 import logging
 from collections.abc import Collection
+from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 
@@ -18,40 +20,69 @@ class FencedPolicy(FilePolicy):
     """A policy in a TorchScript or ONNX file."""
 
     def __init__(
-        self,
-        stored: ForeignFile,
-        child: Child,
-        contract: PolicyContract,
-        *,
-        path: str,
-        attributes: Collection[str] = (),
+        self, stored: ForeignFile, program: Started, contract: PolicyContract, *, path: str, encoder: Started | None
     ) -> None:
         """Try the program on zeros and find out how to run it in batches.
 
         Args:
-            child: the process that has loaded it.
-            attributes: names that the file's classes declare, for TorchScript.
+            program: the process that has loaded it.
+            encoder: the same of the network that runs first, where the contract has one.
 
         Raises:
             PolicyError: the program fails on zeros, or its input or output has the wrong width.
         """
         self.stored, self.contract, self.path = stored, contract, path
-        self._child = child
-        answer = child.ask("prepare", interface=Interface.of(contract).to_dict(), attributes=sorted(attributes))
+        self._child, self._encoder = program.child, None if encoder is None else encoder.child
+        main, batched = Interface.of(contract), True
+        if encoder is not None and contract.encoder is not None:
+            widths = dict(contract.input_widths)
+            own = widths.pop(contract.encoder.input) if contract.encoder.input else contract.observation_width
+            if len(widths) > 1:
+                raise PolicyError(
+                    f"'{path}' has an encoder and {len(widths)} further inputs ({', '.join(widths)}); one is allowed"
+                )
+            answer = encoder.prepare(Interface(inputs={"": own}, num_joints=0))
+            if width := answer.get("width"):
+                raise PolicyError(f"its encoder '{contract.encoder.file}' takes {width} values; its layout gives it {own}")
+            self._latents, batched = Interface(inputs={"": own}, num_joints=answer["num_joints"]), answer["batched"]
+            main = replace(main, inputs={"": sum(widths.values()) + answer["num_joints"]})
+        self._main = main
+        answer = program.prepare(main)
         if width := answer.get("width"):
-            raise PolicyError(f"'{path}' takes {width} values, {other_width(contract, width)}")
-        self.row_by_row = answer.get("batched") is not True
+            given = f"but its encoder and layout give it {main.observation_width}"
+            raise PolicyError(f"'{path}' takes {width} values, {given if encoder else other_width(contract, width)}")
+        self.row_by_row = not (batched and answer.get("batched") is True)
         if self.row_by_row:
             _warn_of_speed(path)
 
     def session(self, num_episodes: int, *, device: str = "cpu") -> PolicySession:
         """Start work on ``num_episodes`` episodes; the program runs on the CPU wherever the tensors are."""
-        return FencedSession(self._child, num_episodes, self.contract, self.path, device=torch.device(device))
+        return self._begin(num_episodes, torch.device(device), rowwise=False)
 
     def rowwise_session(self, num_episodes: int) -> PolicySession:
         """Start work on ``num_episodes`` episodes, each of which goes through the program alone."""
-        cpu = torch.device("cpu")
-        return FencedSession(self._child, num_episodes, self.contract, self.path, device=cpu, rowwise=True)
+        return self._begin(num_episodes, torch.device("cpu"), rowwise=True)
+
+    def _begin(self, num_episodes: int, device: torch.device, *, rowwise: bool) -> PolicySession:
+        settings: dict[str, Any] = {"device": device, "rowwise": rowwise}
+        main = FencedSession(self._child, num_episodes, self._main, self.path, **settings)
+        if self._encoder is None:
+            return main
+        encoder = FencedSession(self._encoder, num_episodes, self._latents, self.path, **settings)
+        return EncodedSession(encoder, main, self.contract)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Started:
+    """A program in its process."""
+
+    child: Child
+    attributes: Collection[str]
+    """Names that the file's classes declare, for TorchScript."""
+
+    def prepare(self, interface: Interface) -> dict[str, Any]:
+        """Try the program on zeros; return its answer, see the programs' ``answer``."""
+        return self.child.ask("prepare", interface=interface.to_dict(), attributes=sorted(self.attributes))
 
 
 @functools.cache  # once, and not again in each process that is forked from this one
@@ -70,7 +101,7 @@ class FencedSession(PolicySession):
         self,
         child: Child,
         num_episodes: int,
-        contract: PolicyContract,
+        contract: Interface | PolicyContract,
         source: str,
         *,
         device: torch.device,
@@ -94,3 +125,28 @@ class FencedSession(PolicySession):
         action = self._ask(self._session, observation, self._forget)
         self._forget = None
         return action if self._device is None else action.to(self._device)
+
+
+class EncodedSession(PolicySession):
+    """Two programs, one after the other: the second one is given what the first one gives."""
+
+    def __init__(self, encoder: PolicySession, main: PolicySession, contract: PolicyContract) -> None:
+        """Begin with a contract that has an ``encoder``."""
+        assert contract.encoder is not None
+        self._encoder, self._main = encoder, main
+        self._latent_first, self._input = contract.encoder.latent == "first", contract.encoder.input
+        self._names, self._widths = list(contract.input_widths), list(contract.input_widths.values())
+
+    def reset(self, episodes: torch.Tensor | None = None) -> None:
+        """See ``PolicySession``."""
+        self._encoder.reset(episodes)
+        self._main.reset(episodes)
+
+    def act(self, observation: torch.Tensor, rows: torch.Tensor | None = None) -> torch.Tensor:
+        """See ``PolicySession``."""
+        seen, rest = observation, [observation]
+        if self._input:
+            parts = dict(zip(self._names, observation.split(self._widths, dim=1), strict=True))
+            seen, rest = parts.pop(self._input).contiguous(), list(parts.values())
+        latent = self._encoder.act(seen)
+        return self._main.act(torch.cat([latent, *rest] if self._latent_first else [*rest, latent], dim=1))

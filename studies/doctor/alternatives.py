@@ -6,14 +6,13 @@ by the names of their joints.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any, get_args
+from typing import get_args
 
-from ...policy.contract import PER_JOINT, ContractError, HistoryOrder, ObservationTerm, PolicyContract, reordered
+from ...policy.contract import ContractError, HistoryOrder, ObservationTerm, PolicyContract, reordered
 from ...policy.observation_table import observation
 from ...robots import Robot, RobotError
 from ...robots.body_plan import BodyPlan, body_plan
@@ -42,28 +41,6 @@ def alternatives(contract: PolicyContract, robot: Robot) -> list[Alternative]:
         for each in make(contract, robot):
             found.setdefault(each.contract.hash, each)
     return list(found.values())[1:]
-
-
-def toml_lines(contract: PolicyContract, other: PolicyContract | None = None) -> list[str]:
-    """Lines of a ``contract.toml``: those that turn ``other`` into this contract, all of it where there is no other.
-
-    Tables come last, as TOML wants them.
-    """
-    data, old = contract.to_dict(), {} if other is None else other.to_dict()
-    if data["joint_names"] != old.get("joint_names"):  # values that the file leaves out would go with their joints
-        old = {k: v for k, v in old.items() if k not in PER_JOINT or len(set(v or ())) == 1}
-    changed = {k: v for k, v in data.items() if k not in ("provenance", "schema_version") and v != old.get(k)}
-    terms = changed.pop("observation", ())
-    lines = [f"{key} = {_toml(value)}" for key, value in changed.items() if value is not None]
-    for term in terms:
-        lines += ["[[observation]]", *(f"{k} = {_toml(v)}" for k, v in term.items() if v is not None)]
-    return lines
-
-
-def _toml(value: Any) -> str:
-    if isinstance(value, dict):
-        return "{ " + ", ".join(f"{k} = {_toml(v)}" for k, v in value.items() if v is not None) + " }"
-    return json.dumps(value)  # lists, numbers and texts are written alike
 
 
 # ---- joints ---------------------------------------------------------------------------------------------------------

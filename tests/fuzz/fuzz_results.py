@@ -16,7 +16,7 @@ from gaitgauge.files.parsing import edited
 from gaitgauge.gauge.report.page import write_report
 from gaitgauge.gauge.result import Result
 from gaitgauge.policy.contract import standard_contract
-from gaitgauge.policy.foreign.adapters import described_contract
+from gaitgauge.policy.foreign.described import described_contract
 from gaitgauge.policy.foreign.fence.archive import packed, read_archive
 from gaitgauge.policy.native import StoredNetwork
 from gaitgauge.policy.networks.architectures import MlpNetwork

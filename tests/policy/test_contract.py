@@ -173,5 +173,7 @@ def test_difference_names_the_fields(contract):
 
 def test_a_width_that_is_some_frames_says_how_to_write_them():
     one = replace(standard_contract(load_robot("go2")), history=History(length=1))
-    assert other_width(one, 225).endswith("observation has 45; 5 frames are 225: history = { length = 5 }")
+    sentence = other_width(one, 225)
+    assert "observation has 45 (base_angular_velocity_b 3, projected_gravity_b 3, command 3, " in sentence
+    assert sentence.endswith("; 5 frames are 225: history = { length = 5 }")
     assert other_width(one, 47).endswith("observation has 45")

@@ -15,7 +15,7 @@ from gaitgauge.policy import finding
 from gaitgauge.policy.base import PolicyError
 from gaitgauge.policy.contract import ContractError, PolicyContract
 from gaitgauge.policy.finding import find_policy
-from gaitgauge.policy.foreign.adapters import described_contract
+from gaitgauge.policy.foreign.described import described_contract
 from gaitgauge.policy.importing import import_policy
 from gaitgauge.policy.loading import load_policy
 from gaitgauge.policy.native import save_policy

@@ -9,11 +9,11 @@ import pytest
 from gaitgauge.gauge.suite import load_suite
 from gaitgauge.policy.contract import PolicyContract, standard_contract
 from gaitgauge.policy.export.files import export_onnx
-from gaitgauge.policy.foreign.adapters import described_contract
+from gaitgauge.policy.foreign.described import described_contract, toml_lines
 from gaitgauge.policy.loading import load_policy
 from gaitgauge.robots import load_robot
 from gaitgauge.studies.doctor import diagnosis
-from gaitgauge.studies.doctor.alternatives import Alternative, alternatives, toml_lines
+from gaitgauge.studies.doctor.alternatives import Alternative, alternatives
 from gaitgauge.studies.doctor.diagnosis import Diagnosis, Outcome, diagnose
 
 GO2 = load_robot("go2")
