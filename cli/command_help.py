@@ -15,7 +15,7 @@ COMMAND_GROUPS: Mapping[str, tuple[str, ...]] = {
     "Judge": ("evaluate", "compare", "verify", "board"),
     "Study": ("consistency", "validate", "trial", "latent", "sweep"),
     "Learn": ("train",),
-    "Use": ("play", "export", "import"),
+    "Use": ("play", "export", "import", "contract"),
     "Look": ("list", "doctor", "robot", "warmup"),
 }
 """Commands by their heading in the help."""

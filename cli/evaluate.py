@@ -42,6 +42,7 @@ def run_evaluation(request: Request, *, out: Path | None, resume: bool, clip: bo
 
         options = [request.policy, "--suite", request.suite] + ["--trust"] * request.trust
         options += ["--robot", request.robot] if request.robot else []
+        options += ["--contract", request.contract] if request.contract else []
         if sentence := make_clip(folder, result, options):
             console.say(sentence)
         else:

@@ -38,7 +38,7 @@ def run_export(request: ExportRequest) -> None:
     if unitree and form != "all":
         raise UserError(f"--layout unitree always writes ONNX and deploy.yaml; leave out --format {form}")
     path = policy_file(request.policy)
-    loaded, body = open_policy(str(path), request.robot, trust=request.trust)
+    loaded, body = open_policy(str(path), request.robot, trust=request.trust, contract_file=request.contract)
     # Beside the checkpoint of a run, where users of Isaac Lab look for it.
     beside = path.parent if (path.parent / "run.json").is_file() else Path()
     folder = request.out or beside / ("unitree" if unitree else "exported")

@@ -11,12 +11,12 @@ from rich.table import Table
 
 from ..files.parsing import did_you_mean
 from ..files.writing import same_file
-from .console import Terminal, make_table
+from .console import Terminal, make_table, print_json
 from .errors import UserError
 
 if TYPE_CHECKING:
-    from ..policy.contract import PolicyContract
-    from .requests import ImportRequest
+    from ..policy.contract import Part, PolicyContract
+    from .requests import ImportRequest, ShowRequest
 
 _HASH = 12
 """Digits of a contract's hash that are shown in lists; enough to tell policies apart by eye."""
@@ -65,6 +65,29 @@ def import_file(request: ImportRequest) -> None:
     console.print(contract_table(policy.contract))
 
 
+def write_contract(out: Path, robot: str, *, force: bool) -> None:
+    """Write a commented ``contract.toml``. Raises UserError: the file exists, or cannot be written."""
+    from ..files.writing import write_atomically
+    from ..policy.foreign.described import template
+    from ..robots import load_robot
+
+    if out.exists() and not force:
+        raise UserError(f"'{out}' already exists; give another name, or replace it with --force")
+    write_atomically(out, template(load_robot(robot)), UserError)
+    Terminal().say(f"wrote {out}; give it as --contract {out}, or lay it beside the policy as contract.toml")
+
+
+def show_contract(request: ShowRequest) -> None:
+    """Print the contract that a policy is run with."""
+    from .policies import open_policy
+
+    policy, _ = open_policy(request.policy, request.robot, trust=request.trust, contract_file=request.contract)
+    if request.json_output:
+        print_json(policy.contract.to_dict())
+    else:
+        Terminal().print(contract_table(policy.contract))
+
+
 def contract_table(contract: PolicyContract) -> Table:
     """Return a policy contract as a table for people."""
     from ..policy.robot_of import REMEMBERED
@@ -85,14 +108,24 @@ def contract_table(contract: PolicyContract) -> Table:
         "control period [s]": f"{contract.control_period:g}",
         "observation": ", ".join(f"{t.name} × {_numbers(t.scale)}" for t in contract.observation),
         "history": "current frame" if history.length == 1 else frames,
+        "layout": "; ".join(map(_part, contract.layout)) or None,
+        "encoder": None if (e := contract.encoder) is None else f"{e.file}, its output {e.latent}",
+        "action offset [rad]": None if contract.action_offset is None else _numbers(contract.action_offset),
         "observation width": str(contract.observation_width),
         "command limits": "forward {:g} m/s, sideways {:g} m/s, turning {:g} rad/s".format(*contract.command_limits),
         "made from": ", ".join(f"{k} {v}" for k, v in contract.provenance.items() if k != REMEMBERED) or "unknown",
         "contract hash": contract.hash,
     }
     for name, value in rows.items():
-        table.add_row(name, value)
+        if value is not None:
+            table.add_row(name, value)
     return table
+
+
+def _part(part: Part) -> str:
+    """Return a part of a layout in words."""
+    frames = "as in history" if part.length is None else f"{part.length} frame{'s' * (part.length > 1)}"
+    return f"{part.input or 'input'}: {', '.join(part.terms) or 'all terms'}, {frames} {part.order or ''}".rstrip()
 
 
 def _numbers(values: Sequence[float]) -> str:

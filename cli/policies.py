@@ -15,7 +15,7 @@ from .errors import UserError
 
 
 def open_policy(
-    choice: str, robot: str | None, *, trust: bool, contract_file: Path | None = None
+    choice: str, robot: str | None, *, trust: bool, contract_file: Path | str | None = None
 ) -> tuple[FilePolicy, Robot]:
     """Load a policy, and the robot that it runs on: the one asked for, else its contract's.
 

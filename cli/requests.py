@@ -18,8 +18,10 @@ from ..files.choices import (
     WRITTEN,
     Choice,
     ClusterAddress,
+    ContractName,
     DeviceName,
     EngineName,
+    PolicyName,
     RobotName,
     ThreadCount,
     Trust,
@@ -68,11 +70,11 @@ class PlayRequest:
     gamepad: Annotated[bool, Choice("Steer the window with a gamepad.", WATCHED)] = False
     trust: Trust = False
     robot: RobotName = None
+    contract: ContractName = None
     suite: Annotated[str, _SUITE] = "gaitgauge-1"
 
 
 _EXAMINED = "A policy to examine, as for play. Default: this machine is examined."
-_CONTRACT = "A contract.toml that describes how the policy is to be run."
 _EACH = "How long each description is played [s]. Default: 2."
 
 
@@ -81,7 +83,7 @@ class DoctorRequest:
     """Hold the options of ``doctor``."""
 
     policy: Annotated[str | None, Choice(_EXAMINED, None, "policies", "POLICY", argument=True)] = None
-    contract: Annotated[Path | None, Choice(_CONTRACT, metavar="PATH")] = None
+    contract: ContractName = None
     robot: RobotName = None
     seconds: Annotated[float | None, Ge(0.5), Le(20.0), Choice(_EACH, PLAYED)] = None
     threads: ThreadCount = None
@@ -106,11 +108,22 @@ class ExportRequest:
     layout: Annotated[str, Choice(_LAYOUT, None, LAYOUTS)] = "plain"
     trust: Trust = False
     robot: RobotName = None
+    contract: ContractName = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShowRequest:
+    """Hold the options of ``contract show``."""
+
+    policy: PolicyName
+    contract: ContractName = None
+    robot: RobotName = None
+    trust: Trust = False
+    json_output: Annotated[bool, Choice("Print JSON instead of a table.", WRITTEN, flags=("--json",))] = False
 
 
 _TRAINABLE = "Keep teacher and critic of a training checkpoint, for train --init-from."
 _SOURCE = "TorchScript, ONNX (with a deploy.yaml beside it) or rsl_rl checkpoint."
-_CONTRACT_OF = "A contract.toml that says how a TorchScript or ONNX file is to be run, in place of what the file says."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -123,7 +136,7 @@ class ImportRequest:
     trainable: Annotated[bool, Choice(_TRAINABLE)] = False
     raw: Annotated[bool, Choice("The same with the weights after the last update, not their average.")] = False
     trust: Trust = False
-    contract: Annotated[Path | None, Choice(_CONTRACT_OF)] = None
+    contract: ContractName = None
     robot: Annotated[str | None, Choice("Robot name, or a robot.toml. Default: go2.", None, "robots")] = None
 
 
@@ -138,6 +151,7 @@ class VerifyRequest:
     card: Annotated[Path, Choice("A score card: results.json, a copy of it, or its folder.", metavar="CARD")]
     policy: Annotated[str | None, Choice("The policy's file, where it is not at the card's path.")] = None
     suite: Annotated[str | None, Choice("The card's suite file, where its suite does not ship.", PLAYED)] = None
+    contract: ContractName = None
     device: Annotated[str | None, Choice("cpu or cuda. Default: what the card's engine is made for.", PLACE)] = None
     threads: ThreadCount = None
     quick: Annotated[bool, Choice(_QUICK, PLAYED)] = False

@@ -23,7 +23,9 @@ from .studies import resumable
 def run_verification(asked: VerifyRequest) -> None:
     """Replay, show progress, print whether the card holds; exit code 1 where it does not."""
     content, place, fresh = load_result(asked.card), asked.card.resolve(), asked.fresh
-    kept = {name: getattr(asked, name) for name in ("policy", "suite", "threads", "quick", "fresh", "trust")}
+    kept = {
+        name: getattr(asked, name) for name in ("policy", "suite", "threads", "quick", "fresh", "trust", "contract")
+    }
     beside, device = place if place.is_dir() else place.parent, choose_device(content.backend, asked.device)
     prepared = prepare_replay(content, beside=beside, device=device, **kept)
     (name,) = distinct_names([str(place.parent if place.name == "results.json" else place)])

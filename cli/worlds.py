@@ -9,6 +9,7 @@ from typing import Any
 from ..backends.registry import choose_device
 from ..gauge.suite import load_suite
 from ..policy.base import Policy
+from ..policy.loading import own_contract
 from ..robots import Robot
 from ..studies.naming import distinct_names
 from ..terrains.gauge_terrains import LEVELS
@@ -36,7 +37,12 @@ class WorldMaker:
         """Return a robot with a policy on a terrain. Raises PolicyError, ContractError, TerrainError, BackendError, UserError."""
         ground = make_terrain(terrain, level)
         if choice not in self._policies:
-            self._policies[choice] = open_policy(choice, self._request.robot, trust=self._request.trust)
+            self._policies[choice] = open_policy(
+                choice,
+                self._request.robot,
+                trust=self._request.trust,
+                contract_file=own_contract(choice, self._request.contract),
+            )
         policy, robot = self._policies[choice]
         return PlaySession(policy, robot, ground, friction=friction, label=label, **self._settings)
 

@@ -75,10 +75,12 @@ _CLUSTER = (
     "Results do not depend on it."
 )
 _THREADS = "CPU threads; results do not depend on them. Default: all cores."
+_CONTRACT = "How a policy without a contract of its own is run: contract.toml, deploy.yaml, config.yaml, env.yaml …"
 _ROBOT = "Robot name, or a robot.toml. Default: the robot that the policy is for."
 _DEVICE = "cpu or cuda; the default is what the engine is made for."
 PolicyName = Annotated[str, Choice(_ONE, None, "policies", "POLICY")]
 PolicyNames = Annotated[tuple[str, ...], Choice(_MORE, None, "policies", "POLICY...")]
+ContractName = Annotated[str | None, Choice(_CONTRACT, PLAYED, metavar="FILE")]
 Trust = Annotated[bool, Choice("Run the program that a policy file of the project's own format carries inside.")]
 SuiteName = Annotated[
     str, Choice("Suite name (see 'gaitgauge list suites') or a suite's .toml file.", PLAYED, "suites")

@@ -161,7 +161,10 @@ def edited(source: str, error: type[Exception], *others: type[Exception]) -> Ite
 
 
 def parse_yaml(text: str, source: str, error: type[Exception]) -> Any:
-    """Return the plain data of YAML text without tags; raise ``error`` where it is no valid YAML, nested too deep or has merge keys."""
+    """Return the plain data of YAML text; raise ``error`` where it is no valid YAML, nested too deep, has merge keys or tags.
+
+    Tagged tuples and slices of Python are read as the lists that follow their tags.
+    """
     try:
         data = yaml.load(text, _Loader)
     except (yaml.YAMLError, ValueError, OverflowError, AttributeError, TypeError, RecursionError) as problem:
@@ -176,6 +179,15 @@ class _Loader(yaml.SafeLoader):
         for key, _ in node.value:
             if key.tag == "tag:yaml.org,2002:merge":
                 raise yaml.constructor.ConstructorError(None, None, "merge keys (<<) are not read", key.start_mark)
+
+
+def _sequence(loader: yaml.SafeLoader, node: yaml.SequenceNode) -> list[Any]:
+    return loader.construct_sequence(node, deep=True)
+
+
+# Isaac Lab and Unitree's exporter write a tuple and a slice so; they are the list that follows the tag.
+for _tag in ("tuple", "object/apply:builtins.slice"):
+    _Loader.add_constructor(f"tag:yaml.org,2002:python/{_tag}", _sequence)
 
 
 def _reason(problem: BaseException) -> str:

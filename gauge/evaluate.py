@@ -128,7 +128,7 @@ def prepare(request: Request) -> Prepared:
         check_terrain(suite, make_terrain(name, int(highest)), searched=environment.searched)
     # foreign files take their contract from the robot that is asked for
     asked = None if request.robot is None else load_robot(request.robot)
-    policy = load_policy(request.policy, asked, trust=request.trust)
+    policy = load_policy(request.policy, asked, trust=request.trust, contract_file=request.contract)
     robot = robot_for(policy.contract, request.robot)
     check_fit(suite, robot, policy.contract)
     return Prepared(

@@ -9,6 +9,7 @@ from ..files.choices import (
     PLAYED,
     Choice,
     ClusterAddress,
+    ContractName,
     DeviceName,
     EngineName,
     PolicyName,
@@ -36,6 +37,7 @@ class EvaluationOptions:
     backend: EngineName = "mujoco"
     device: DeviceName = None
     robot: RobotName = None
+    contract: ContractName = None
     terrains: TerrainNames = ()
     level: Annotated[int | None, Choice("Play at this level (1-10) instead of searching for the highest.", PLAYED)] = (
         None

@@ -18,7 +18,7 @@ def import_policy(
     robot: str | None = None,
     *,
     trust: bool = False,
-    contract_file: Path | None = None,
+    contract_file: Path | str | None = None,
 ) -> FilePolicy:
     """Write a policy and its contract into one file of the project's own format; its actions stay the same.
 

@@ -18,7 +18,6 @@ from .finding import find_policy
 from .foreign.adapters import (
     LONGEST_HISTORY,
     assumptions,
-    checkpoint_network,
     contract_for_width,
     deploy_contract,
     find_deploy_file,
@@ -27,6 +26,7 @@ from .foreign.adapters import (
 )
 from .foreign.described import described_contract
 from .foreign.fence.archive import archive_names, read_limited
+from .foreign.rsl_rl import checkpoint_network
 from .native import FilePolicy, ForeignFile, NativePolicy, StoredNetwork, is_policy, load_entries, read_policy
 
 if TYPE_CHECKING:
@@ -37,7 +37,11 @@ DEFAULT_ROBOT = "go2"
 
 
 def load_policy(
-    path_or_name: str | Path, robot: Robot | None = None, *, trust: bool = False, contract_file: Path | None = None
+    path_or_name: str | Path,
+    robot: Robot | None = None,
+    *,
+    trust: bool = False,
+    contract_file: Path | str | None = None,
 ) -> FilePolicy:
     """Load a policy and try it on zeros.
 
@@ -60,7 +64,7 @@ def load_policy(
     path = find_policy(path_or_name)
     data = read_limited(path)
     stand_in = robot or load_robot(DEFAULT_ROBOT)
-    contract = None if contract_file is None else described_contract(contract_file, stand_in)
+    contract = None if contract_file is None else described_contract(Path(contract_file), stand_in)
     policy = _load(data, path, str(path_or_name), stand_in, trust=trust, contract=contract)
     policy.file_sha256 = hashlib.sha256(data).hexdigest()
     if sentence := assumptions(policy.contract):
@@ -68,6 +72,21 @@ def load_policy(
     if robot is not None:
         check_robot(policy.contract, robot)
     return policy
+
+
+def own_contract(path_or_name: str | Path, contract_file: str | None) -> str | None:
+    """Return the description for one of several policies: None for a file that has its contract inside.
+
+    Raises:
+        PolicyError: no such file or name.
+    """
+    if contract_file is None:
+        return None
+    path = find_policy(path_or_name)
+    data = read_limited(path)
+    source = str(path_or_name)
+    own = file_kind(data, source) == "torch" and is_policy(load_entries(data, source=source))
+    return None if own else contract_file
 
 
 def restore_policy(

@@ -13,7 +13,7 @@ from ..files.parsing import one_line, read_results
 from ..policy.base import PolicyError
 from ..policy.contract import ContractError
 from ..policy.finding import find_policy
-from ..policy.loading import load_policy
+from ..policy.loading import load_policy, own_contract
 from ..policy.native import FilePolicy
 from ..policy.robot_of import robot_for, without_copy
 from ..robots import Robot, RobotError, load_robot
@@ -34,7 +34,7 @@ class Loaded:
 
 
 def load_policies(
-    names: Sequence[str], robot: str | None = None, *, trust: bool = False
+    names: Sequence[str], robot: str | None = None, *, trust: bool = False, contract_file: str | None = None
 ) -> tuple[dict[str, Loaded], list[Refused]]:
     """Policies by label, see ``distinct_names``, and those that could not be loaded.
 
@@ -42,6 +42,7 @@ def load_policies(
         names: what ``gaitgauge evaluate`` takes; one that is named twice is loaded once.
         robot: name of the robot that they have to fit, or its ``robot.toml``; None for each one's own.
         trust: run programs that files of the project's own format carry inside.
+        contract_file: description of those that have no contract inside.
 
     Raises:
         RobotError: the robot that was asked for cannot be had.
@@ -52,7 +53,7 @@ def load_policies(
     names = list(dict.fromkeys(names))
     for name, label in zip(names, distinct_names(names), strict=True):
         try:
-            policy = load_policy(name, asked, trust=trust)
+            policy = load_policy(name, asked, trust=trust, contract_file=own_contract(name, contract_file))
             loaded = Loaded(policy=policy, robot=robot_for(policy.contract, robot))
         except (PolicyError, ContractError, RobotError) as error:
             refused.append({"what": name, "reason": str(error)})

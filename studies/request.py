@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated
 
-from ..files.choices import PLACE, Choice, FirstSeed, PolicyNames, RobotName, ThreadCount, Trust
+from ..files.choices import PLACE, Choice, ContractName, FirstSeed, PolicyNames, RobotName, ThreadCount, Trust
 
 _ENGINE = Choice("Physics engine, see 'gaitgauge list backends'.", PLACE, "backends", flags=("--backend", "--engine"))
 
@@ -18,5 +18,6 @@ class PoliciesRequest:
     seed: FirstSeed = 0
     backend: Annotated[str, _ENGINE] = "mujoco"
     robot: RobotName = None
+    contract: ContractName = None
     threads: ThreadCount = None
     trust: Trust = False

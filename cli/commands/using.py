@@ -7,12 +7,13 @@ from typing import Annotated
 
 import typer
 
-from ...files.choices import Choice, ThreadCount
-from ..requests import DoctorRequest, ExportRequest, ImportRequest, PlayRequest
+from ...files.choices import Choice, RobotName, ThreadCount
+from ..requests import DoctorRequest, ExportRequest, ImportRequest, PlayRequest, ShowRequest
 from ..running import command
 
 app = typer.Typer()
 robot = typer.Typer(no_args_is_help=True, help="Describe a robot of your own, and check it.")
+contract = typer.Typer(no_args_is_help=True, help="Describe how a policy is to be run, and see how it is.")
 
 LISTS = ("robots", "terrains", "backends", "suites", "scenarios", "policies", "tasks")
 """Kinds of names that can be listed."""
@@ -98,6 +99,39 @@ def check(
 
     if not check_robot_files(robot, picture=picture, draw=not no_picture, json_output=json_output):
         raise typer.Exit(1)
+
+
+app.add_typer(contract, name="contract")
+
+
+@command(contract, "new")
+def new_contract(
+    out: Annotated[Path, Choice("File to write.", metavar="FILE", argument=True)] = Path("contract.toml"),
+    robot: RobotName = "go2",
+    force: Annotated[bool, Choice("Replace a file that is there.")] = False,
+) -> None:
+    """Write a commented contract.toml: all that a policy can be described with, with the robot's usual values.
+
+    Examples:
+      gaitgauge contract new
+      gaitgauge contract new b2.toml --robot mine/b2/robot.toml
+    """
+    from ..inspect import write_contract
+
+    write_contract(out, robot or "go2", force=force)
+
+
+@command(contract)
+def show(request: ShowRequest) -> None:
+    """Print how a policy is run, where that was read and what was assumed.
+
+    Examples:
+      gaitgauge contract show policy.onnx
+      gaitgauge contract show model_1500.pt --contract params/deploy.yaml
+    """
+    from ..inspect import show_contract
+
+    show_contract(request)
 
 
 @command(app, "list")

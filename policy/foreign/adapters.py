@@ -6,12 +6,9 @@ Every adapter notes in the contract's provenance where it took the facts from an
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
-
-import torch
 
 from ...files.parsing import parse_yaml, read_text
 from ...robots.base import Robot
@@ -24,7 +21,6 @@ from ..contract import (
     PolicyContract,
     standard_contract,
 )
-from ..native import StoredNetwork
 from ..observation_table import ObservationError, foreign_observation
 
 AT_ONCE = 1.0
@@ -280,96 +276,3 @@ def _mjlab_contract(metadata: Mapping[str, str], robot: Robot, source: str) -> P
         command_limits=robot.command_limits,
         provenance={"adapter": "mjlab metadata", "assumed": "control period 0.02 s, command limits of the robot"},
     )
-
-
-def checkpoint_network(
-    entries: Mapping[str, Any], robot: Robot, *, path: Path
-) -> tuple[PolicyContract, StoredNetwork] | None:
-    """Return the network and contract of a bare rsl_rl checkpoint, None if it is not one.
-
-    Understood are a plain perceptron as the actor, with or without input normalisation, and a student of concurrent
-    teacher-student training (``student_encoder``). The activation is the one in ``params/agent.yaml`` beside it, else
-    ELU.
-
-    Raises:
-        PolicyError: it is one, but of another kind, of a width that the standard contract does not have, or with missing or
-            malformed entries.
-    """
-    try:
-        return _checkpoint_network(entries, robot, path)
-    except (KeyError, IndexError, TypeError, ValueError, AttributeError, RuntimeError, OverflowError) as error:
-        if isinstance(error, (PolicyError, ContractError)):
-            raise
-        raise PolicyError(
-            f"'{path}' is an rsl_rl checkpoint with a missing or malformed entry ({type(error).__name__}: {error})"
-        ) from error
-
-
-def _checkpoint_network(
-    entries: Mapping[str, Any], robot: Robot, path: Path
-) -> tuple[PolicyContract, StoredNetwork] | None:
-    weights = next(
-        (w for k in ("actor_state_dict", "model_state_dict") if isinstance(w := entries.get(k), Mapping) and w), None
-    )
-    if not isinstance(weights, Mapping) or not all(isinstance(v, torch.Tensor) for v in weights.values()):
-        return None
-    actor, encoder = _layers(weights, "actor|mlp", "network"), _layers(weights, "student_encoder", "encoder")
-    strange = [k for k in weights if k.startswith(("memory", "rnn", "cnn", "student.", "estimator"))]
-    if not actor or strange:
-        raise PolicyError(
-            f"'{path}' is an rsl_rl checkpoint without a plain perceptron as its actor "
-            f"(it has '{(strange or list(weights) or ['nothing'])[0]}')"
-        )
-    activation = _activation(path)
-    contract = standard_contract(
-        robot, provenance={"adapter": "rsl_rl checkpoint", "assumed": f"standard observation, {activation}"}
-    )
-    frame = contract.frame_width
-    arguments: dict[str, Any] = {"frame_width": frame, "num_actions": contract.num_joints, "activation": activation}
-    actor_widths = _widths(actor)
-    if encoder:
-        encoder_widths = _widths(encoder)
-        arguments.update(
-            history_length=encoder_widths[0] // frame,
-            latent_width=encoder_widths[-1],
-            encoder_hidden=encoder_widths[1:-1],
-            actor_hidden=actor_widths[1:-1],
-        )
-        state = encoder | _layers(weights, "actor|mlp", "actor")
-        return contract, StoredNetwork(architecture="cts", arguments=arguments, state_dict=state)
-    if actor_widths[0] != frame or actor_widths[-1] != contract.num_joints:
-        raise PolicyError(
-            f"'{path}' has an actor of {actor_widths[0]} inputs and {actor_widths[-1]} outputs; "
-            f"without a contract only {frame} and {contract.num_joints} are understood"
-        )
-    arguments.update(hidden=actor_widths[1:-1])
-    normalizer = next((p for p in ("obs_normalizer.", "actor_obs_normalizer.") if p + "_mean" in weights), None)
-    if normalizer:
-        arguments.update(normalize=True)
-        # rsl_rl divides by the standard deviation plus this constant.
-        actor["mean"], actor["deviation"] = weights[normalizer + "_mean"], weights[normalizer + "_std"] + 0.01
-    return contract, StoredNetwork(architecture="mlp", arguments=arguments, state_dict=actor)
-
-
-def _layers(weights: Mapping[str, torch.Tensor], names: str, ours: str) -> dict[str, torch.Tensor]:
-    """Return the layers of the perceptron that is called one of ``names``, called ``ours``."""
-    found = {k: v for k, v in weights.items() if re.match(rf"({names})\.\d+\.(weight|bias)$", k)}
-    return {f"{ours}.{k.split('.', 1)[1]}": v for k, v in found.items()}
-
-
-def _widths(layers: Mapping[str, torch.Tensor]) -> list[int]:
-    """Return the widths of a perceptron from its weights, input first."""
-    weights = sorted(
-        ((int(k.split(".")[1]), v) for k, v in layers.items() if k.endswith("weight")), key=lambda pair: pair[0]
-    )
-    return [weights[0][1].shape[1], *(w.shape[0] for _, w in weights)]
-
-
-def _activation(path: Path) -> str:
-    """Return the activation that the training configuration beside a checkpoint names, ELU if there is none."""
-    settings = path.parent / "params" / "agent.yaml"
-    if not settings.is_file():
-        return "elu"
-    text = read_text(settings, "training configuration", PolicyError)
-    found = re.search(r"^\s*activation:\s*['\"]?(\w+)", text, re.MULTILINE)
-    return found.group(1).lower() if found else "elu"

@@ -43,7 +43,9 @@ class FencedPolicy(FilePolicy):
                 )
             answer = encoder.prepare(Interface(inputs={"": own}, num_joints=0))
             if width := answer.get("width"):
-                raise PolicyError(f"its encoder '{contract.encoder.file}' takes {width} values; its layout gives it {own}")
+                raise PolicyError(
+                    f"its encoder '{contract.encoder.file}' takes {width} values; its layout gives it {own}"
+                )
             self._latents, batched = Interface(inputs={"": own}, num_joints=answer["num_joints"]), answer["batched"]
             main = replace(main, inputs={"": sum(widths.values()) + answer["num_joints"]})
         self._main = main

@@ -69,6 +69,53 @@ class MlpNetwork(nn.Module):
         return self.network(features)
 
 
+class RecurrentNetwork(nn.Module):
+    """Act by a perceptron on what a recurrent layer (LSTM or GRU) remembers, as rsl_rl's recurrent actors do.
+
+    State dict: ``rnn.*`` as torch names it, ``network.<layer>.weight|bias``, and ``mean``, ``deviation`` (1, F) if ``normalize``.
+    """
+
+    mean: torch.Tensor
+    deviation: torch.Tensor
+
+    def __init__(
+        self,
+        *,
+        frame_width: int,
+        num_actions: int,
+        cell: str = "lstm",
+        memory_width: int = 256,
+        layers: int = 1,
+        hidden: Sequence[int] = (512, 256, 128),
+        activation: str = "elu",
+        normalize: bool = False,
+    ) -> None:
+        super().__init__()
+        if cell not in ("lstm", "gru"):
+            raise ValueError(f"unknown recurrent layer '{cell}'; choose from: lstm, gru")
+        self.history_length, self.frame_width, self.normalize = 1, frame_width, normalize
+        self.shape, self.tensors = (layers, memory_width), 2 if cell == "lstm" else 1
+        if normalize:
+            self.register_buffer("mean", torch.zeros(1, frame_width))
+            self.register_buffer("deviation", torch.ones(1, frame_width))
+        self.rnn = (nn.LSTM if cell == "lstm" else nn.GRU)(frame_width, memory_width, layers)
+        self.network = multilayer_perceptron((memory_width, *hidden, num_actions), activation=activation)
+
+    def initial_state(self, n: int) -> torch.Tensor:
+        """Return the state at the start of an episode, (n, S)."""
+        return torch.zeros(n, self.tensors * self.shape[0] * self.shape[1])
+
+    def forward(self, history: torch.Tensor, state: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return actions (N, J) and the next state (N, S) for ``history`` (N, 1, F)."""
+        features = history[:, -1]
+        if self.normalize:
+            features = (features - self.mean) / self.deviation
+        memory = state.unflatten(1, (self.tensors, *self.shape)).permute(1, 2, 0, 3).contiguous()
+        out, new = self.rnn(features[None], tuple(memory) if self.tensors == 2 else memory[0])
+        following = torch.stack(new if self.tensors == 2 else (new,)).permute(2, 0, 1, 3).flatten(1)
+        return self.network(out[0]), following
+
+
 class CtsNetwork(EncoderNetwork):
     """The student of concurrent teacher-student training: an encoder of the history, and an actor on its unit latent
     (paper, method).
@@ -164,6 +211,7 @@ class MoeCtsNetwork(EncoderNetwork):
 
 ARCHITECTURES: dict[str, Callable[..., nn.Module]] = {
     "mlp": MlpNetwork,
+    "recurrent": RecurrentNetwork,
     "cts": CtsNetwork,
     "moe_cts": MoeCtsNetwork,
     "ac_moe": AcMoeNetwork,

@@ -57,6 +57,7 @@ def prepare_replay(
     quick: bool = False,
     fresh: int | None = None,
     trust: bool = False,
+    contract: str | None = None,
 ) -> Prepared:
     """Return the evaluation that checks a card.
 
@@ -64,6 +65,7 @@ def prepare_replay(
         policy: the policy's file, where it is not at the card's path and none that ships.
         beside: the card's folder, where its policy is looked for as well.
         suite: name or ``.toml`` file, where the suite is one of the user's own.
+        contract: description of the policy, where the card was made with one.
         quick: one environment of each terrain, at nominal friction and payload where the card has it, else the card's first.
         fresh: number from which other seeds than the card's are made; None for the card's.
 
@@ -106,6 +108,7 @@ def prepare_replay(
             seeds=card.chance.seeds,
             threads=threads,
             trust=trust,
+            contract=contract,
         )
     )
     stated, observed = card.policy.observations, [t.name for t in prepared.policy.contract.observation]

@@ -14,6 +14,7 @@ from ...gauge.result import EnvironmentRow, PolicyName, Provenance, Result, Suit
 from ...gauge.results import chance_rules
 from ...gauge.store import check_folder
 from ...policy.finding import find_policy
+from ...policy.loading import own_contract
 from ...robots.loading import robot_digest
 from ..naming import distinct_names, run_folders
 from .comparison import ComparisonError, check_alike, check_different, compare, load_result
@@ -49,7 +50,9 @@ def compare_all(
     if len(contestants) < 2:
         raise ComparisonError(f"a comparison needs at least two policies or results; only '{contestants[0]}' was given")
     found = {c: load_result(Path(c)) for c in contestants if is_result(c)}
-    requests = {c: replace(request, policy=c) for c in contestants if c not in found}
+    requests = {
+        c: replace(request, policy=c, contract=own_contract(c, request.contract)) for c in contestants if c not in found
+    }
     prepared_requests = {c: prepare(wanted) for c, wanted in requests.items()}
     check_different([found.get(c) or find_policy(c).resolve() for c in contestants], contestants)
     check_alike([found.get(c) or _known_before(prepared_requests[c]) for c in contestants], contestants)

@@ -7,7 +7,18 @@ from typing import Annotated
 
 from annotated_types import Ge
 
-from ...files.choices import PLACE, PLAYED, Choice, PolicyNames, RobotName, SuiteName, TerrainNames, ThreadCount, Trust
+from ...files.choices import (
+    PLACE,
+    PLAYED,
+    Choice,
+    ContractName,
+    PolicyNames,
+    RobotName,
+    SuiteName,
+    TerrainNames,
+    ThreadCount,
+    Trust,
+)
 
 MARGIN = 0.02
 """Difference of quality that does not matter: it moves the score of a levelled terrain by 0.004, less than its repeatability."""
@@ -34,6 +45,7 @@ class StudyRequest:
     device: Annotated[str | None, Choice(_DEVICE, PLACE)] = None
     suite: SuiteName = "robogauge-1.1"
     robot: RobotName = None
+    contract: ContractName = None
     terrains: TerrainNames = ()
     levels: Annotated[tuple[int, ...], Choice(_LEVELS, PLAYED)] = ()
     frictions: Annotated[tuple[float, ...], Choice(_FRICTIONS, PLAYED)] = ()

@@ -22,6 +22,7 @@ from ...gauge.play.sampling import GRAVITY
 from ...gauge.results import health
 from ...gauge.store import RunFolder, StoreError
 from ...gauge.suite import Suite, SuiteError, load_suite
+from ...policy.loading import own_contract
 from ...policy.native import FilePolicy
 from ...robots import Robot
 from ...robots.body_plan import total_mass
@@ -131,6 +132,7 @@ def prepare_study(request: StudyRequest) -> PreparedStudy:
                 level=levels[0] if request.levels or any(t != "flat" for t in terrains) else None,
                 frictions=frictions,
                 trust=request.trust,
+                contract=own_contract(name, request.contract),
             )
         )
         if robot is not None and robot_digest(robot) != robot_digest(prepared_policy.robot):

@@ -53,7 +53,9 @@ def study_latents(
     began = time.perf_counter()
     find_backend(request.backend, "cpu")
     suite, terrains = _ground(request)
-    policies, refused = load_policies(request.policies, request.robot, trust=request.trust)
+    policies, refused = load_policies(
+        request.policies, request.robot, trust=request.trust, contract_file=request.contract
+    )
     entries: list[dict[str, Any]] = []
     points: list[tuple[str, Notes, dict[str, NDArray[np.float64]]]] = []
     for number, (label, loaded) in enumerate(policies.items(), 1):

@@ -43,7 +43,9 @@ def run_trials(
     began = time.perf_counter()
     device = choose_device(request.backend, request.device)
     find_backend(request.backend, device)
-    policies, refused = load_policies(request.policies, request.robot, trust=request.trust)
+    policies, refused = load_policies(
+        request.policies, request.robot, trust=request.trust, contract_file=request.contract
+    )
     scenarios: dict[str, Scenario] = {}
     names = [n for name in request.scenarios or (ALL,) for n in (scenario_names() if name == ALL else [name])]
     for name in dict.fromkeys(names):

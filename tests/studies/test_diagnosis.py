@@ -82,7 +82,7 @@ def test_values_that_were_the_robots_own_go_with_their_joints():
 def test_histories_are_tried_where_there_is_one():
     stacked = replace(GOOD, history=replace(GOOD.history, length=5, order="term-major"))
     orders = {a.contract.history.order for a in alternatives(stacked, GO2) if a.kind == "order of history"}
-    assert orders == {"frame-major", "frame-major-newest-first"}
+    assert orders == {"frame-major", "frame-major-newest-first", "term-major-newest-first"}
     assert not any("history" in a.kind for a in alternatives(GOOD, GO2))
 
 
