@@ -103,7 +103,9 @@ def load_results(path: str | Path) -> Result:
     return read_result(Path(path), ResultsError, words=" was edited or is damaged")
 
 
-def load_policy(policy: str | Path, *, robot: str | None = None, trust: bool = False) -> Policy:
+def load_policy(
+    policy: str | Path, *, robot: str | None = None, trust: bool = False, contract: str | Path | None = None
+) -> Policy:
     """Load a policy: own format, TorchScript, ONNX or an rsl_rl checkpoint.
 
     Args:
@@ -111,6 +113,7 @@ def load_policy(policy: str | Path, *, robot: str | None = None, trust: bool = F
         robot: name of the robot, or the path of its ``robot.toml``; a foreign file gets its contract from it, from the Go2 if
             this is None.
         trust: run the program that a file of the project's own format carries inside.
+        contract: description of a file without a contract of its own, such as a ``contract.toml``.
 
     Raises:
         PolicyError, ContractError, RobotError: one sentence on what is wrong.
@@ -120,7 +123,7 @@ def load_policy(policy: str | Path, *, robot: str | None = None, trust: bool = F
     from .policy.loading import load_policy as load
     from .robots import load_robot
 
-    return load(str(policy), None if robot is None else load_robot(robot), trust=trust)
+    return load(str(policy), None if robot is None else load_robot(robot), trust=trust, contract_file=contract)
 
 
 def evaluate(

@@ -127,7 +127,7 @@ def _load(
                 "add --trust (in Python trust=True) to run it, in a process of its own"
             )
         return _foreign(network, path, source, robot, contract=inside)
-    found = checkpoint_network(entries, robot, path=path, contract=contract)
+    found = checkpoint_network(entries, robot, path=path, contract=contract or sidecar_contract(path, robot))
     if found is None:
         raise PolicyError(f"'{source}' is a torch.save file, but neither a gaitgauge policy nor an rsl_rl checkpoint")
     described, network = found
@@ -186,7 +186,7 @@ def _foreign_contract(
     child: Child, kind: str, metadata: Mapping[str, str], path: Path, source: str, robot: Robot
 ) -> PolicyContract:
     """Return the contract beside a file or in it, of its deploy.yaml or mjlab metadata, or else the standard one of the input's width."""
-    contract = sidecar_contract(path)
+    contract = sidecar_contract(path, robot)
     if contract is None and "contract" in metadata:
         contract = _stored_contract(metadata["contract"], source)
     if contract is None and kind == "onnx":

@@ -182,8 +182,8 @@ def stacked_contract(contract: PolicyContract, frames: int) -> PolicyContract:
 def mjlab_metadata(contract: PolicyContract) -> dict[str, str]:
     """Return metadata under mjlab's names. Lists are joined by commas; a term with a scale per entry joins them by semicolons.
 
-    mjlab clips a whole term to one magnitude, and does it before scaling; nothing is returned for a contract with clips that
-    need more than that, or that has an observation without a name there, so that its runtime refuses the file.
+    mjlab clips a whole term to one magnitude, and does it before scaling; nothing is returned for a contract that needs more than
+    that, or has an observation without a name or a layout that it cannot say, so that its runtime refuses the file.
     """
 
     def numbers(values: tuple[float, ...]) -> str:
@@ -192,7 +192,10 @@ def mjlab_metadata(contract: PolicyContract) -> dict[str, str]:
     terms = contract.observation
     limits = [_limit_before_scaling(term) for term in terms]
     names = [observation(term.name).foreign_names[:1] for term in terms]
-    if None in limits or () in names:
+    further = (
+        contract.action_offset or contract.layout or contract.memory or any(t.reference or t.values for t in terms)
+    )
+    if None in limits or () in names or further:
         return {}
     return {
         "run_path": str(contract.provenance.get("run", "")),

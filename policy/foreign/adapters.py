@@ -22,6 +22,7 @@ from ..contract import (
     standard_contract,
 )
 from ..observation_table import ObservationError, foreign_observation
+from .described import described_contract
 
 AT_ONCE = 1.0
 """Time after standing within which a fall says that the policy is run wrongly [s]."""
@@ -30,8 +31,15 @@ GUESSES = ("ONNX", "TorchScript", "rsl_rl checkpoint")
 """Adapters that take the whole observation for granted."""
 
 
-def sidecar_contract(path: Path) -> PolicyContract | None:
-    """Return the contract in ``<stem>.contract.json`` or ``contract.json`` beside a file, else None; raise ``PolicyError`` if malformed."""
+def sidecar_contract(path: Path, robot: Robot) -> PolicyContract | None:
+    """Return the contract in ``<stem>.contract.toml``, ``contract.toml`` or the same with ``.json`` beside a file, else None.
+
+    Raises:
+        PolicyError: it is malformed.
+    """
+    for written in (path.with_name(f"{path.stem}.contract.toml"), path.with_name("contract.toml")):
+        if written.is_file():
+            return described_contract(written, robot)
     for sidecar in (path.with_name(f"{path.stem}.contract.json"), path.with_name("contract.json")):
         if sidecar.is_file():
             try:
