@@ -66,7 +66,7 @@ def _deploy(content: bytes, folder: Path) -> None:
 def _sidecar(content: bytes, folder: Path) -> None:
     path = folder / "contract.json"
     path.write_bytes(content)
-    if sidecar_contract(folder / "policy.pt") is None:
+    if sidecar_contract(folder / "policy.pt", ROBOT) is None:
         raise PolicyError("there is no contract")
 
 

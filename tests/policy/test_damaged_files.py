@@ -195,7 +195,7 @@ def test_contracts_that_are_none(tmp_path, cts_file, text):
     refused(cts_file, "cts.gauge.pt")
     (tmp_path / "contract.json").write_text(text)
     with pytest.raises(PolicyError, match=r"contract\.json"):
-        sidecar_contract(tmp_path / "policy.pt")
+        sidecar_contract(tmp_path / "policy.pt", load_robot("go2"))
 
 
 @pytest.mark.parametrize(
