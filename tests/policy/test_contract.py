@@ -176,4 +176,4 @@ def test_a_width_that_is_some_frames_says_how_to_write_them():
     sentence = other_width(one, 225)
     assert "observation has 45 (base_angular_velocity_b 3, projected_gravity_b 3, command 3, " in sentence
     assert sentence.endswith("; 5 frames are 225: history = { length = 5 }")
-    assert other_width(one, 47).endswith("observation has 45")
+    assert other_width(one, 47).endswith("last_action 12)")
