@@ -19,6 +19,7 @@ _OWN = {
     "mujoco": ".mujoco:MujocoBackend",
     "mujoco-warp": ".mujoco_warp:MujocoWarpBackend",
     "newton": ".newton:NewtonBackend",
+    "drake": ".drake:DrakeBackend",
 }
 
 

@@ -26,7 +26,7 @@ from . import readout_kernels as readout
 from .buffers import MassTensors, contact_structure
 from .description import describe_newton
 from .model import BIRTH_HEIGHT, build_world_model
-from .solvers import SOLVERS, SolverAdapter, dry_friction_slope
+from .solvers import SOLVERS, SolverAdapter
 
 
 class NewtonBackend(WarpBackend):

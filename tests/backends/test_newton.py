@@ -189,7 +189,7 @@ def test_import_differences_are_found():
 
 
 def test_dry_friction_slope_stops_a_joint_within_a_step_or_two():
-    from gaitgauge.backends.newton.solvers import dry_friction_slope
+    from gaitgauge.backends.dry_friction import dry_friction_slope
 
     reference = compiled()
     dofs = np.array([int(reference.joint(name).dofadr[0]) for name in ROBOT.joint_names])

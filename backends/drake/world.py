@@ -1,0 +1,189 @@
+"""One world of Drake: a context of a plant, and a simulator that advances it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from pydrake.geometry import ProximityProperties, RoleAssign
+from pydrake.multibody.plant import CoulombFriction
+from pydrake.systems.analysis import Simulator
+
+from ..sequential import Base, Contacts, RobotModel, World
+from ..sequential.world import Array
+from .hydroelastic import deepest, mean_normal, thickness
+from .plant import Plant, spatial_inertia
+
+
+class DrakeWorld(World):
+    """See ``World``."""
+
+    def __init__(self, built: Plant, robot: RobotModel, timestep: float) -> None:
+        self._built, self._robot, self._timestep = built, robot, timestep
+        self._simulator = Simulator(built.diagram)
+        self._root = self._simulator.get_mutable_context()
+        self._context = built.plant.GetMyMutableContextFromRoot(self._root)
+        self._sources = built.scene_graph.GetMyMutableContextFromRoot(self._root)
+        plant = built.plant
+        self._forces = plant.get_applied_generalized_force_input_port().FixValue(
+            self._context, np.zeros(plant.num_velocities())
+        )
+        self._results = plant.get_contact_results_output_port()
+        self._ticks = 0
+        base = built.bodies[0]
+        self._base_q = base.floating_positions_start()
+        self._base_v = base.floating_velocities_start_in_v()
+        self._foot_shapes = [robot.foot(i) for i in range(max(shape.foot for shape in robot.shapes) + 1)]
+        self._thickness = [thickness(shape) for shape in robot.shapes]
+        self._center = robot.links[0].center
+        self._friction = robot.foot_friction
+        self._q = plant.GetPositions(self._context)
+        self._v = plant.GetVelocities(self._context)
+
+    def place(self, base: Base, joint_position: Array, joint_velocity: Array) -> None:
+        """See ``World.place``."""
+        q, v, turn = self._q.copy(), self._v.copy(), rotation(base.quaternion)
+        q[self._base_q : self._base_q + 4], q[self._base_q + 4 : self._base_q + 7] = base.quaternion, base.position
+        v[self._base_v : self._base_v + 3] = turn @ base.angular_velocity
+        v[self._base_v + 3 : self._base_v + 6] = base.linear_velocity
+        q[self._built.joint_q], v[self._built.joint_v] = joint_position, joint_velocity
+        self._q, self._v, self._ticks = q, v, 0
+        if np.isfinite(q).all() and np.isfinite(v).all():
+            self._built.plant.SetPositions(self._context, q)
+            self._built.plant.SetVelocities(self._context, v)
+            self._root.SetTime(0.0)
+            self._simulator.Initialize()
+
+    def step(self, torque: Array, force_w: Array) -> None:
+        """See ``World.step``."""
+        applied = np.zeros(len(self._v))
+        applied[self._built.joint_v] = torque
+        if force_w.any():
+            arm = rotation(self._q[self._base_q : self._base_q + 4]) @ self._center
+            applied[self._base_v : self._base_v + 3] = np.cross(arm, force_w)
+            applied[self._base_v + 3 : self._base_v + 6] = force_w
+        self._forces.GetMutableData().set_value(applied)
+        self._ticks += 1
+        self._simulator.AdvanceTo(self._ticks * self._timestep)
+        self._q = self._built.plant.GetPositions(self._context)
+        self._v = self._built.plant.GetVelocities(self._context)
+
+    def joints(self) -> tuple[Array, Array]:
+        """See ``World.joints``."""
+        return self._q[self._built.joint_q], self._v[self._built.joint_v]
+
+    def base(self) -> Base:
+        """See ``World.base``."""
+        q, v = self._q[self._base_q : self._base_q + 7], self._v[self._base_v : self._base_v + 6]
+        return Base(
+            position=q[4:7],
+            quaternion=q[0:4] / np.linalg.norm(q[0:4]),
+            linear_velocity=v[3:6],
+            angular_velocity=rotation(q[0:4]).T @ v[0:3],
+        )
+
+    def feet(self) -> tuple[Array, Array]:
+        """See ``World.feet``."""
+        plant, positions, velocities = self._built.plant, [], []
+        for shape in self._foot_shapes:
+            body = self._built.bodies[shape.link]
+            place = plant.EvalBodyPoseInWorld(self._context, body)
+            motion = plant.EvalBodySpatialVelocityInWorld(self._context, body)
+            arm = place.rotation().matrix() @ shape.position
+            positions.append(place.translation() + arm)
+            velocities.append(motion.translational() + np.cross(motion.rotational(), arm))
+        return np.array(positions), np.array(velocities)
+
+    def contacts(self) -> Contacts:
+        """See ``World.contacts``."""
+        results, rows = self._results.Eval(self._context), []
+        for i in range(results.num_point_pair_contacts()):
+            info = results.point_pair_contact_info(i)
+            pair = info.point_pair()
+            force, normal = info.contact_force(), -pair.nhat_BA_W  # on B, and from A to B
+            rows.append((pair.id_B, pair.id_A, force, normal, info.contact_point(), np.zeros(3), pair.depth))
+        for i in range(results.num_hydroelastic_contacts()):
+            info = results.hydroelastic_contact_info(i)
+            surface, force = info.contact_surface(), info.F_Ac_W()
+            mine = surface.id_M() if surface.id_M() in self._built.shape_of else surface.id_N()
+            if mine not in self._built.shape_of:
+                continue
+            extent = self._thickness[self._built.shape_of[mine]]
+            rows.append(
+                (
+                    *(surface.id_M(), surface.id_N(), force.translational(), mean_normal(surface)),
+                    *(surface.centroid(), force.rotational(), deepest(surface, extent)),
+                )
+            )
+        shape_of, terrain, kept = self._built.shape_of, self._built.terrain, []
+        for first, second, force, normal, point, moment, depth in rows:
+            if first in shape_of and second in terrain:
+                kept.append((shape_of[first], force, force @ normal, point, moment, depth, terrain[second]))
+            elif second in shape_of and first in terrain:
+                kept.append((shape_of[second], -force, force @ normal, point, -moment, depth, terrain[first]))
+        columns: Any = zip(*kept, strict=True) if kept else ([], np.zeros((0, 3)), [], np.zeros((0, 3)), np.zeros((0, 3)), [], [])
+        shape, force, normal, point, moment, depth, on_terrain = columns
+        return Contacts(
+            shape=np.array(shape, dtype=np.int64),
+            force_w=np.array(force),
+            normal=np.array(normal, dtype=np.float64),
+            point_w=np.array(point),
+            moment_w=np.array(moment),
+            depth=np.array(depth, dtype=np.float64),
+            terrain=np.array(on_terrain, dtype=np.bool_),
+        )
+
+    def change(self, changes: Mapping[str, Array]) -> None:
+        """See ``World.change``."""
+        built = self._built
+        for body, (mass, center, inertia) in zip(built.bodies, self._robot.inertias(changes), strict=True):
+            body.SetSpatialInertiaInBodyFrame(self._context, spatial_inertia(mass, center, inertia))
+        self._center = self._robot.inertias(changes)[0][1]
+        friction = float(changes.get("friction", self._robot.foot_friction))
+        if friction != self._friction:
+            self._friction = friction
+            source = built.plant.get_source_id()
+            for geometry, nominal in built.properties.items():
+                properties = ProximityProperties(nominal)
+                properties.UpdateProperty("material", "coulomb_friction", CoulombFriction(friction, friction))
+                built.scene_graph.AssignRole(self._sources, source, geometry, properties, RoleAssign.kReplace)
+
+    def constants(self) -> dict[str, Any]:
+        """See ``World.constants``."""
+        built, plant = self._built, self._built.plant
+        inertias = [body.CalcSpatialInertiaInBodyFrame(self._context) for body in built.bodies]
+        places = {link.collision_body: i for i, link in enumerate(self._robot.links) if link.collision_body >= 0}
+        chosen = [inertias[places[i]] for i in range(len(places))]
+        joints = [plant.get_joint_actuator(index).joint() for index in plant.GetJointActuatorIndices()]
+        order = np.argsort([np.flatnonzero(built.joint_v == joint.velocity_start())[0] for joint in joints])
+        inspector = built.scene_graph.get_query_output_port().Eval(self._sources).inspector()
+
+        def friction(geometry: Any) -> float:
+            return inspector.GetProximityProperties(geometry).GetProperty("material", "coulomb_friction").dynamic_friction()
+
+        feet = {self._robot.shapes[shape].foot: geometry for geometry, shape in built.shape_of.items()}
+        return {
+            "total_mass": plant.CalcTotalMass(self._context),
+            "body_mass": [each.get_mass() for each in chosen],
+            "body_inertia": [each.Shift(each.get_com()).CalcRotationalInertia().CopyToFullMatrix3() for each in chosen],
+            "joint_range": [(joints[i].position_lower_limits()[0], joints[i].position_upper_limits()[0]) for i in order],
+            "joint_armature": [
+                plant.get_joint_actuator(plant.GetJointActuatorIndices()[i]).rotor_inertia(self._context) for i in order
+            ],
+            "joint_damping": [joints[i].GetDamping(self._context) for i in order],
+            "foot_friction": [friction(feet[i]) for i in range(len(self._foot_shapes))],
+            "floor_friction": friction(next(iter(built.terrain))),
+        }
+
+
+def rotation(quaternion: Array) -> Array:
+    """Return the matrix (3, 3) of a quaternion wxyz of any length."""
+    w, x, y, z = quaternion / np.linalg.norm(quaternion)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )

@@ -1,0 +1,7 @@
+"""What engines on the CPU share that hold one world in one object: the loop over worlds, the motor law, the readout."""
+
+from .backend import SequentialBackend
+from .robot import Link, RobotModel, Shape, read_robot
+from .world import Base, Contacts, World
+
+__all__ = ["Base", "Contacts", "Link", "RobotModel", "SequentialBackend", "Shape", "World", "read_robot"]
