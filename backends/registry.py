@@ -5,9 +5,11 @@ A name may carry a variant after a colon (``newton:steel``), which selects the e
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
+from importlib.metadata import version
 from importlib.util import find_spec
 
 from ..files.parsing import one_line, shown
@@ -15,12 +17,6 @@ from ..files.plugins import guarded, load_plugin, origin, plugins
 from .base import BackendError, DeviceError, PhysicsBackend, Scene, Support
 
 GROUP = "gaitgauge.backends"
-_OWN = {
-    "mujoco": ".mujoco:MujocoBackend",
-    "mujoco-warp": ".mujoco_warp:MujocoWarpBackend",
-    "newton": ".newton:NewtonBackend",
-    "drake": ".drake:DrakeBackend",
-}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,15 +31,67 @@ class BackendListing:
     """One line for people."""
     missing: tuple[str, ...]
     """Packages that the engine needs and that are not installed."""
+    install: str
+    """Command that installs them."""
+    version: str
+    """Versions of its packages, empty where they are not installed or not known."""
+    terms: str
+    """Licence, empty where it is not known."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Own:
+    """An engine of the project."""
+
+    place: str
+    """Module and class."""
+    device: str
+    packages: tuple[str, ...]
+    note: str
+    distributions: tuple[str, ...]
+    """What pip calls the engine itself, and what it needs under other terms."""
+    terms: str
+    extra: str = ""
+    """Extra of gaitgauge that installs the engine; empty where it always is."""
 
 
 _SLOW = "runs on the CPU slowly (--device cpu)"
 _OTHER_SOLVER = "newton:SOLVER runs another one (newton:steel)"
-# Device, packages and note of the project's own engines.
-_ABOUT: dict[str, tuple[str, tuple[str, ...], str]] = {
-    "mujoco": ("CPU", ("mujoco",), "MuJoCo on a thread pool, float64, the same on any number of threads; the judge"),
-    "mujoco-warp": ("GPU", ("mujoco_warp", "warp"), f"MuJoCo's equations on the GPU, float32; trains; {_SLOW}"),
-    "newton": ("GPU", ("newton", "mujoco_warp", "warp"), f"Newton with its MuJoCo solver; {_OTHER_SOLVER}"),
+_MOSEK = "its dependency Mosek is proprietary and not used"
+_OWN: dict[str, _Own] = {
+    "mujoco": _Own(
+        place=".mujoco:MujocoBackend",
+        device="CPU",
+        packages=("mujoco",),
+        note="MuJoCo on a thread pool, float64, the same on any number of threads; the judge",
+        distributions=("mujoco",),
+        terms="Apache-2.0",
+    ),
+    "mujoco-warp": _Own(
+        place=".mujoco_warp:MujocoWarpBackend",
+        device="GPU",
+        packages=("mujoco_warp", "warp"),
+        note=f"MuJoCo's equations on the GPU, float32; trains; {_SLOW}",
+        distributions=("mujoco-warp",),
+        terms="Apache-2.0",
+    ),
+    "newton": _Own(
+        place=".newton:NewtonBackend",
+        device="GPU",
+        packages=("newton", "mujoco_warp", "warp"),
+        note=f"Newton with its MuJoCo solver; {_OTHER_SOLVER}",
+        distributions=("newton",),
+        terms="Apache-2.0",
+    ),
+    "drake": _Own(
+        place=".drake.backend:DrakeBackend",
+        device="CPU",
+        packages=("pydrake",),
+        note="Drake with its SAP solver, float64; an independent judge",
+        distributions=("drake",),
+        terms=f"BSD-3-Clause; {_MOSEK}",
+        extra="drake",
+    ),
 }
 
 
@@ -57,14 +105,34 @@ def list_backends() -> list[BackendListing]:
     found = plugins(GROUP)
     listings = []
     for name in backend_names():
-        if name in _ABOUT:
-            device, packages, note = _ABOUT[name]
+        if own := _OWN.get(name):
+            device, packages, note, terms = own.device, own.packages, own.note, own.terms
+            versions = own.distributions
         else:
             value = one_line(found[name].value, 80)
             device, packages, note = "?", (value.partition(":")[0].partition(".")[0],), f"plug-in, {value}"
+            terms, versions = "", ()
         missing = tuple(p for p in packages if not p.isidentifier() or find_spec(p) is None)
-        listings.append(BackendListing(name=name, device=device, note=note, missing=missing))
+        listings.append(
+            BackendListing(
+                name=name,
+                device=device,
+                note=note,
+                missing=missing,
+                install=_install(name, missing) if missing else "",
+                version="" if missing else ", ".join(f"{each} {version(each)}" for each in versions),
+                terms=terms,
+            )
+        )
     return listings
+
+
+def _install(name: str, missing: Sequence[str]) -> str:
+    """Return the command that installs what an engine lacks."""
+    own = _OWN.get(name)
+    if own is not None and own.extra:
+        return f"pip install 'gaitgauge[{own.extra}]'"
+    return "pip install " + " ".join(each.replace("_", "-") for each in missing)
 
 
 def backend_class(name: str) -> type[PhysicsBackend]:
@@ -72,7 +140,7 @@ def backend_class(name: str) -> type[PhysicsBackend]:
     engine = name.partition(":")[0]
     try:
         if engine in _OWN:
-            module, _, attribute = _OWN[engine].partition(":")
+            module, _, attribute = _OWN[engine].place.partition(":")
             found = getattr(import_module(module, __package__), attribute)
         else:
             plugin = plugins(GROUP).get(engine)
@@ -85,7 +153,8 @@ def backend_class(name: str) -> type[PhysicsBackend]:
                 raise BackendError(f"{origin(plugin)} gave {gave}; it must be a subclass of PhysicsBackend")
             guarded(plugin, BackendError, found.capabilities)
     except ImportError as error:
-        missing = f"needs the package '{error.name}', which is not installed: pip install {error.name}"
+        command = _install(engine, (error.name or "",))
+        missing = f"needs the package '{error.name}', which is not installed: {command}"
         raise BackendError(f"backend '{name}' {missing}") from error
     return found
 
@@ -116,12 +185,12 @@ def choose_device(name: str, asked: str | None = None) -> str:
     found = find_backend(name, "cpu" if asked is None else asked)
     if asked is not None:
         return asked
-    made_for_gpu = _ABOUT.get(name.partition(":")[0], ("", (), ""))[0] == "GPU"
+    own = _OWN.get(name.partition(":")[0])
+    made_for_gpu = own is not None and own.device == "GPU"
     if made_for_gpu and not cuda.is_available():
         change = "add --device cpu (slow), or use --backend mujoco"
         raise DeviceError(f"backend '{name}' wants a GPU and this machine has none", change)
-    plugin = name.partition(":")[0] not in _OWN
-    return "cuda" if made_for_gpu or (plugin and _can_use_gpu(found) and cuda.is_available()) else "cpu"
+    return "cuda" if made_for_gpu or (own is None and _can_use_gpu(found) and cuda.is_available()) else "cpu"
 
 
 def _can_use_gpu(found: type[PhysicsBackend]) -> bool:

@@ -187,11 +187,10 @@ def _terrains() -> Table:
 def _backends() -> Table:
     from ..backends.registry import list_backends
 
-    table = make_table("backends (--backend NAME)", "name", "available here", "runs on", "what it is")
+    table = make_table("backends (--backend NAME)", "name", "available here", "runs on", "what it is", "licence")
     for each in list_backends():
-        missing = " ".join(p.replace("_", "-") for p in each.missing)
-        available = f"no: pip install {missing}" if missing else "yes"
-        table.add_row(each.name, available, each.device, each.note)
+        available = f"no: {each.install}" if each.missing else each.version or "yes"
+        table.add_row(each.name, available, each.device, each.note, each.terms)
     return table
 
 

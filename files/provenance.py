@@ -8,6 +8,7 @@ import platform
 import shlex
 import subprocess
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from datetime import UTC, datetime
 from functools import cache
 from importlib.metadata import PackageNotFoundError, distributions, version
@@ -17,6 +18,8 @@ from typing import Any
 from ..version import __version__
 
 PACKAGES = ("mujoco", "mujoco-warp", "newton", "warp-lang", "torch", "numpy", "rsl-rl-lib", "onnxruntime")
+OPTIONAL = ("drake", "ovphysx", "ovstage")
+"""Packages of engines that extras install; named where they are installed."""
 _GROUPS = "gaitgauge."
 _JUDGING = ("backends", "files", "gauge", "policy", "robots", "terrains")
 _ROOT = Path(__file__).resolve().parents[1]
@@ -65,6 +68,9 @@ def versions() -> dict[str, str]:
             found[package] = version(package)
         except PackageNotFoundError:
             found[package] = "not installed"
+    for package in OPTIONAL:
+        with suppress(PackageNotFoundError):
+            found[package] = version(package)
     return found
 
 

@@ -552,7 +552,8 @@ class Result(Scores):
     @property
     def engine_version(self) -> str | None:
         """Version of the engine's package; None where it has none of its own."""
-        return self.provenance.versions.get(self.backend.partition(":")[0])
+        engine = self.backend.partition(":")[0]
+        return self.provenance.versions.get({"physx": "ovphysx"}.get(engine, engine))
 
     @property
     def versions(self) -> dict[str, str | None]:

@@ -1,5 +1,1 @@
 """Drake on the CPU (extra ``[drake]``)."""
-
-from .backend import DrakeBackend
-
-__all__ = ["DrakeBackend"]

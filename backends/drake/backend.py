@@ -5,18 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import ClassVar
 
-from ..base import Capability, PhysicsOptions, Scene, Support
+from ..base import Capability, PhysicsOptions, Scene
 from ..sequential import SequentialBackend, World
-from .plant import APPROXIMATION, Plant, build_plant
+from .hydroelastic import MODULUS
+from .limits import LIMITS
+from .plant import APPROXIMATION, RELAXATION, Plant, build_plant
 from .world import DrakeWorld
-
-
-def _roughly(note: str) -> Capability:
-    return Capability(support=Support.APPROXIMATE, note=note)
-
-
-def _none(note: str) -> Capability:
-    return Capability(support=Support.NONE, note=note)
 
 
 class DrakeBackend(SequentialBackend):
@@ -24,20 +18,18 @@ class DrakeBackend(SequentialBackend):
 
     name: ClassVar[str] = "drake"
     own_dry_friction: ClassVar[bool] = False
-    limits: ClassVar[Mapping[str, Capability]] = {
-        "height_field": _roughly("hydroelastic contact: the robot's shapes are compliant there, their forces come from areas"),
-        "foot_contact": _none("the feet's contacts are the same in all worlds, but for sliding friction"),
-        "joint_friction": _roughly("an explicit torque that changes sign over a small speed: a joint at rest creeps"),
-        "elliptic_cone": _roughly("friction is the exact cone of a hard contact; impratio has no meaning here"),
-        "foot_condim_6": _none("contacts slide, they have no torsional or rolling friction"),
-        "contact_forces": _roughly("forces of hard contacts: a touchdown's impulse falls into one physics step; no moments"),
-        "penetration": Capability(support=Support.EXACT, note="seen one substep late"),
-    }
+    limits: ClassVar[Mapping[str, Capability]] = LIMITS
 
     @classmethod
     def solver_settings(cls, physics: PhysicsOptions) -> Mapping[str, float | str]:
         """See ``PhysicsBackend.solver_settings``: Drake's own, which ``physics`` does not change."""
-        return {"cone": "elliptic", "approximation": APPROXIMATION, "contact": "point; hydroelastic on height fields"}
+        return {
+            "cone": "elliptic",
+            "approximation": APPROXIMATION,
+            "relaxation_time": RELAXATION * physics.timestep,
+            "hydroelastic_modulus": MODULUS,
+            "licence": "BSD-3-Clause",
+        }
 
     def __init__(self, scene: Scene, *, device: str = "cpu", threads: int = 1) -> None:
         self._plants: dict[int, Plant] = {}

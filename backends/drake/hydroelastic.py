@@ -9,8 +9,10 @@ from ...terrains.base import HeightField
 from ..sequential import Shape
 
 MODULUS = 1e6
-"""Hydroelastic modulus of the robot's shapes [Pa]: a Go2 on its trunk sinks 0.2 mm; at 10⁷ a body that strikes the ground while it
-slides at 3 m/s is thrown up by the solver's approximation."""
+"""Hydroelastic modulus of the robot's shapes but the feet [Pa]: a Go2 on its trunk sinks 0.2 mm; at 10⁷ a body that strikes the
+ground while it slides at 3 m/s is thrown up by the solver's approximation."""
+FOOT_MODULUS = 1e7
+"""Hydroelastic modulus of the feet on height fields [Pa]."""
 FOOT_RESOLUTION = 0.35
 """Edge length of a foot's tetrahedra over its radius."""
 RESOLUTION = 2.0
@@ -46,12 +48,19 @@ def mean_normal(surface: ContactSurface) -> np.ndarray:
     return normal / np.linalg.norm(normal)
 
 
+def modulus(shape: Shape) -> float:
+    """Return the hydroelastic modulus of a robot's shape [Pa]."""
+    return FOOT_MODULUS if shape.foot >= 0 else MODULUS
+
+
 def thickness(shape: Shape) -> float:
-    """Return the depth over which the pressure of a robot's shape rises to the modulus [m]."""
-    return float(shape.size[shape.size > 0.0].min()) if shape.kind != "mesh" else float(np.ptp(shape.vertices, axis=0).min()) / 2.0
+    """Return the depth over which the pressure of a robot's shape rises to its modulus [m]."""
+    half = np.ptp(shape.vertices, axis=0) / 2.0 if shape.kind == "mesh" else shape.size[shape.size > 0.0]
+    return float(half.min())
 
 
-def deepest(surface: ContactSurface, extent: float) -> float:
-    """Return the depth of a contact surface [m]: its largest pressure, which grows linearly over ``extent`` [m]."""
+def deepest(surface: ContactSurface, shape: Shape) -> float:
+    """Return the depth of a robot's shape in a rigid one [m], by the largest pressure of their contact surface."""
     pressure = surface.poly_e_MN()
-    return max(pressure.EvaluateAtVertex(v) for v in range(surface.num_vertices())) / MODULUS * extent
+    largest = max(pressure.EvaluateAtVertex(v) for v in range(surface.num_vertices()))
+    return largest / modulus(shape) * thickness(shape)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -35,13 +36,16 @@ from pydrake.systems.framework import Diagram, DiagramBuilder
 from ...terrains.base import HeightField, Terrain
 from ..base import Scene
 from ..sequential import RobotModel, Shape
-from .hydroelastic import FOOT_RESOLUTION, MODULUS, RESOLUTION, field_mesh, thickness
+from .hydroelastic import FOOT_RESOLUTION, RESOLUTION, field_mesh, modulus, thickness
 
 APPROXIMATION = "sap"
 """Drake's convex approximation of contact; friction of ``lagged``, its default, acts with the normal force of the step before."""
 RELAXATION = 1.0
 """Relaxation time of a shape's contacts over the timestep. The approximation lifts what slides by relaxation time times friction
 times speed: with Drake's default of 0.1 s a foot that slips at 0.1 m/s floats 6 mm high."""
+
+# Drake says of each floor that soft bodies would not meet it; there are none.
+logging.getLogger("drake").addFilter(lambda record: "deformable" not in record.getMessage())
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -108,7 +112,7 @@ def build_plant(scene: Scene, robot: RobotModel, terrain: Terrain) -> Plant:
             AddRigidHydroelasticProperties(1.0, properties)
         elif on_field or of_robot.foot < 0:
             edge = FOOT_RESOLUTION if of_robot.foot >= 0 else RESOLUTION
-            AddCompliantHydroelasticProperties(edge * thickness(of_robot), MODULUS, properties)
+            AddCompliantHydroelasticProperties(edge * thickness(of_robot), modulus(of_robot), properties)
         geometry = plant.RegisterCollisionGeometry(body, place, shape, name, properties)
         found[geometry] = properties
         return geometry

@@ -6,13 +6,13 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from pydrake.geometry import ProximityProperties, RoleAssign
+from pydrake.geometry import GeometryId, ProximityProperties, RoleAssign
 from pydrake.multibody.plant import CoulombFriction
 from pydrake.systems.analysis import Simulator
 
 from ..sequential import Base, Contacts, RobotModel, World
 from ..sequential.world import Array
-from .hydroelastic import deepest, mean_normal, thickness
+from .hydroelastic import deepest, mean_normal
 from .plant import Plant, spatial_inertia
 
 
@@ -35,7 +35,6 @@ class DrakeWorld(World):
         self._base_q = base.floating_positions_start()
         self._base_v = base.floating_velocities_start_in_v()
         self._foot_shapes = [robot.foot(i) for i in range(max(shape.foot for shape in robot.shapes) + 1)]
-        self._thickness = [thickness(shape) for shape in robot.shapes]
         self._center = robot.links[0].center
         self._friction = robot.foot_friction
         self._q = plant.GetPositions(self._context)
@@ -97,40 +96,47 @@ class DrakeWorld(World):
 
     def contacts(self) -> Contacts:
         """See ``World.contacts``."""
-        results, rows = self._results.Eval(self._context), []
+        results, shape_of, terrain = self._results.Eval(self._context), self._built.shape_of, self._built.terrain
+        rows: list[tuple[Any, ...]] = []
+
+        def keep(mine: GeometryId, other: GeometryId, force: Array, moment: Array, **found: Any) -> None:
+            if mine in shape_of and other in terrain:  # else two shapes of the robot
+                rows.append(
+                    (
+                        shape_of[mine],
+                        force,
+                        force @ found["normal"],
+                        found["point"],
+                        moment,
+                        found["depth"],
+                        terrain[other],
+                    )
+                )
+
         for i in range(results.num_point_pair_contacts()):
             info = results.point_pair_contact_info(i)
-            pair = info.point_pair()
-            force, normal = info.contact_force(), -pair.nhat_BA_W  # on B, and from A to B
-            rows.append((pair.id_B, pair.id_A, force, normal, info.contact_point(), np.zeros(3), pair.depth))
+            pair, on_b, zero = info.point_pair(), info.contact_force(), np.zeros(3)
+            found = {"point": info.contact_point(), "depth": pair.depth}
+            keep(pair.id_B, pair.id_A, on_b, zero, normal=-pair.nhat_BA_W, **found)
+            keep(pair.id_A, pair.id_B, -on_b, zero, normal=pair.nhat_BA_W, **found)
         for i in range(results.num_hydroelastic_contacts()):
             info = results.hydroelastic_contact_info(i)
-            surface, force = info.contact_surface(), info.F_Ac_W()
-            mine = surface.id_M() if surface.id_M() in self._built.shape_of else surface.id_N()
-            if mine not in self._built.shape_of:
-                continue
-            extent = self._thickness[self._built.shape_of[mine]]
-            rows.append(
-                (
-                    *(surface.id_M(), surface.id_N(), force.translational(), mean_normal(surface)),
-                    *(surface.centroid(), force.rotational(), deepest(surface, extent)),
-                )
-            )
-        shape_of, terrain, kept = self._built.shape_of, self._built.terrain, []
-        for first, second, force, normal, point, moment, depth in rows:
-            if first in shape_of and second in terrain:
-                kept.append((shape_of[first], force, force @ normal, point, moment, depth, terrain[second]))
-            elif second in shape_of and first in terrain:
-                kept.append((shape_of[second], -force, force @ normal, point, -moment, depth, terrain[first]))
-        columns: Any = zip(*kept, strict=True) if kept else ([], np.zeros((0, 3)), [], np.zeros((0, 3)), np.zeros((0, 3)), [], [])
-        shape, force, normal, point, moment, depth, on_terrain = columns
+            surface, on_m, normal = info.contact_surface(), info.F_Ac_W(), mean_normal(info.contact_surface())
+            force, moment = on_m.translational(), on_m.rotational()
+            for mine, other, sign in ((surface.id_M(), surface.id_N(), 1.0), (surface.id_N(), surface.id_M(), -1.0)):
+                if mine in shape_of and other in terrain:
+                    found = {"point": surface.centroid(), "depth": deepest(surface, self._robot.shapes[shape_of[mine]])}
+                    keep(mine, other, sign * force, sign * moment, normal=sign * normal, **found)
+        shape, force_w, normal_force, point, moment_w, depth, on_terrain = (
+            zip(*rows, strict=True) if rows else ((),) * 7
+        )
         return Contacts(
             shape=np.array(shape, dtype=np.int64),
-            force_w=np.array(force),
-            normal=np.array(normal, dtype=np.float64),
-            point_w=np.array(point),
-            moment_w=np.array(moment),
-            depth=np.array(depth, dtype=np.float64),
+            force_w=np.reshape(force_w, (-1, 3)),
+            normal=np.array(normal_force),
+            point_w=np.reshape(point, (-1, 3)),
+            moment_w=np.reshape(moment_w, (-1, 3)),
+            depth=np.array(depth),
             terrain=np.array(on_terrain, dtype=np.bool_),
         )
 
@@ -160,14 +166,20 @@ class DrakeWorld(World):
         inspector = built.scene_graph.get_query_output_port().Eval(self._sources).inspector()
 
         def friction(geometry: Any) -> float:
-            return inspector.GetProximityProperties(geometry).GetProperty("material", "coulomb_friction").dynamic_friction()
+            return (
+                inspector.GetProximityProperties(geometry)
+                .GetProperty("material", "coulomb_friction")
+                .dynamic_friction()
+            )
 
         feet = {self._robot.shapes[shape].foot: geometry for geometry, shape in built.shape_of.items()}
         return {
             "total_mass": plant.CalcTotalMass(self._context),
             "body_mass": [each.get_mass() for each in chosen],
             "body_inertia": [each.Shift(each.get_com()).CalcRotationalInertia().CopyToFullMatrix3() for each in chosen],
-            "joint_range": [(joints[i].position_lower_limits()[0], joints[i].position_upper_limits()[0]) for i in order],
+            "joint_range": [
+                (joints[i].position_lower_limits()[0], joints[i].position_upper_limits()[0]) for i in order
+            ],
             "joint_armature": [
                 plant.get_joint_actuator(plant.GetJointActuatorIndices()[i]).rotor_inertia(self._context) for i in order
             ],

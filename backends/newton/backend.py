@@ -18,6 +18,7 @@ import warp as wp
 
 from ..arguments import check_force
 from ..base import BackendError, Capability, PhysicsOptions, Randomization, Scene
+from ..dry_friction import dry_friction_slope
 from ..warp.backend import WarpBackend
 from ..warp.device import is_memory_error, memory_advice
 from ..warp.structures import filled, to_warp

@@ -11,7 +11,6 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
-import mujoco
 import mujoco_warp
 import newton
 import numpy as np

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from ..arguments import check_force, check_push, check_randomization, check_start, check_step
 from ..base import (
-    CAPABILITY_NAMES,
     BackendError,
     Capability,
     PhysicsBackend,
@@ -27,6 +26,7 @@ from ..base import (
 from ..description import ModelFields
 from ..devices import find_device
 from ..motor_law import MotorLimits, motor_torque
+from .limits import declare
 from .robot import RobotModel, read_robot
 from .world import Array, Base, World
 
@@ -53,15 +53,14 @@ class SequentialBackend(PhysicsBackend):
 
     parallel_processes: ClassVar[bool] = True
     limits: ClassVar[Mapping[str, Capability]]
-    """Capabilities that are not exact; the GPU need not be named."""
+    """Capabilities that are not exact."""
     own_dry_friction: ClassVar[bool]
     """True where the engine applies the joints' dry friction; else an explicit torque substitutes it."""
 
     @classmethod
     def capabilities(cls) -> Mapping[str, Capability]:
         """Declare everything as exact but ``limits``."""
-        exact = {name: Capability(support=Support.EXACT) for name in CAPABILITY_NAMES}
-        return exact | {"gpu": Capability(support=Support.NONE, note="one CPU core a process")} | dict(cls.limits)
+        return declare(cls.limits)
 
     @abstractmethod
     def build(self, terrain: int) -> World:
@@ -163,7 +162,9 @@ class SequentialBackend(PhysicsBackend):
                 angular_velocity=asked(start.base_angular_velocity, row, np.zeros(3)),
             )
             still = np.zeros(len(pose))
-            self._worlds[row].place(base, asked(start.joint_position, row, pose), asked(start.joint_velocity, row, still))
+            self._worlds[row].place(
+                base, asked(start.joint_position, row, pose), asked(start.joint_velocity, row, still)
+            )
             self._limp[row] = start.held_target is None
             self._target[row] = asked(start.held_target, row, still)
             self._force[row] = 0.0
@@ -285,7 +286,11 @@ class SequentialBackend(PhysicsBackend):
         found = self._worlds[row].contacts()
         foot, body, trunk = (of[found.shape] for of in (self._foot_of, self._body_of, self._trunk))
         across = np.sqrt(np.maximum((found.force_w**2).sum(1) - found.normal**2, 0.0))
-        for name, value in (("contact_force_w", found.force_w), ("normal_force", found.normal), ("tangential_force", across)):
+        for name, value in (
+            ("contact_force_w", found.force_w),
+            ("normal_force", found.normal),
+            ("tangential_force", across),
+        ):
             np.add.at(out[f"foot_{name}"][row], foot[foot >= 0], value[foot >= 0])
         others = (foot < 0) & (body >= 0)
         np.add.at(out["body_contact_force_w"][row], body[others], found.force_w[others])
@@ -353,11 +358,12 @@ class SequentialBackend(PhysicsBackend):
         """See ``PhysicsBackend.describe``."""
         factors = {name: values[0] for name, values in self._motors.items()}
         strength = factors["motor_strength"]
+        passive = {"joint_friction_loss": self._dry} | self._worlds[0].constants()
         return ModelFields(
             stiffness=self._kp * factors["stiffness_scale"] * strength,
             damping=self._kd * factors["damping_scale"] * strength,
             torque_limit=self._limits.torque * strength,
-            **self._worlds[0].constants(),
+            **passive,
         ).describe()
 
     def close(self) -> None:

@@ -123,9 +123,7 @@ def read_robot(scene: Scene) -> RobotModel:
     return RobotModel(
         links=links,
         shapes=shapes,
-        meeting=frozenset(
-            (i, j) for j in range(len(geoms)) for i in range(j) if _meet(model, geoms[i], geoms[j])
-        ),
+        meeting=frozenset((i, j) for j in range(len(geoms)) for i in range(j) if _meet(model, geoms[i], geoms[j])),
         foot_friction=float(np.mean([model.geom(name).friction[0] for name in robot.foot_geoms])),
         friction_slope=dry_friction_slope(model, dofs, scene.physics.timestep),
     )
@@ -143,9 +141,9 @@ def _link(scene: Scene, model: mujoco.MjModel, body: int, order: dict[int, int])
         hinge, axis, anchor = order[joint], model.jnt_axis[joint].copy(), model.jnt_pos[joint].copy()
         if model.jnt_limited[joint]:
             limits = (float(model.jnt_range[joint, 0]), float(model.jnt_range[joint, 1]))
-    turn = np.zeros(9)
-    mujoco.mju_quat2Mat(turn, model.body_iquat[body])
-    turn = turn.reshape(3, 3)
+    flat = np.zeros(9)
+    mujoco.mju_quat2Mat(flat, model.body_iquat[body])
+    turn = flat.reshape(3, 3)
     return Link(
         name=name,
         parent=int(model.body_parentid[body]) - 1,

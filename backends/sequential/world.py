@@ -56,7 +56,11 @@ class World(ABC):
 
     @abstractmethod
     def step(self, torque: Array, force_w: Array) -> None:
-        """Take one physics step with joint torques [N·m] and a force on the base's centre of mass [N]; raise ``RuntimeError`` if it fails."""
+        """Take one physics step with joint torques [N·m] and a force on the base's centre of mass [N].
+
+        Raises:
+            RuntimeError: the engine fails.
+        """
 
     @abstractmethod
     def joints(self) -> tuple[Array, Array]:

@@ -204,6 +204,7 @@ def sources(result: Result) -> dict[str, str]:
         "pipeline": result.pipeline,
         "robot": result.robot,
         "engine": _engine(result),
+        "solver": _in_words(result.solver) or "–",
         "feet": _feet(result),
         "trained in": _in_words([each.to_data() for each in result.training.trained]) or result.training.note or "–",
         "tuned with": _in_words([each.to_data() for each in result.training.tuned]) or "–",

@@ -8,13 +8,17 @@ from __future__ import annotations
 from pathlib import Path
 
 from gaitgauge.backends.base import CAPABILITY_NAMES, Support
+from gaitgauge.backends.drake.limits import LIMITS as DRAKE
 from gaitgauge.backends.registry import find_backend
+from gaitgauge.backends.sequential.limits import declare
 
 DOCUMENT = Path(__file__).parents[2] / "docs" / "reference" / "backends.md"
 
 BEGIN, END = "<!-- capabilities: begin -->", "<!-- capabilities: end -->"
 """The table's place in the document."""
-ENGINES = ("mujoco", "mujoco-warp", "newton", "newton:steel")
+EXTRAS = {"drake": DRAKE}
+"""Limits of engines that extras install, which need not be there."""
+ENGINES = ("mujoco", "mujoco-warp", "newton", "newton:steel", *EXTRAS)
 """Columns: every engine of the project, with each solver."""
 _MARKS = {Support.EXACT: "yes", Support.APPROXIMATE: "about", Support.NONE: "no"}
 
@@ -25,7 +29,8 @@ def capability_table() -> str:
     Raises:
         BackendError: an engine's package is not installed.
     """
-    declared = {name: find_backend(name, "cpu").capabilities() for name in ENGINES}
+    declared = {name: find_backend(name, "cpu").capabilities() for name in ENGINES if name not in EXTRAS}
+    declared |= {name: declare(limits) for name, limits in EXTRAS.items()}
     notes: list[str] = []
     lines = ["| | " + " | ".join(f"`{name}`" for name in ENGINES) + " |", "| --- " * (len(ENGINES) + 1) + "|"]
     for capability in CAPABILITY_NAMES:
