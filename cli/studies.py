@@ -38,7 +38,7 @@ def resumable(console: Terminal, title: str, folder: Path | None = None, *more: 
 
 
 @contextmanager
-def _own_folder(folder: Path) -> Iterator[None]:
+def own_folder(folder: Path) -> Iterator[None]:
     """Lock a folder for this process, and create it where it is missing; an error removes a folder that was created.
 
     Raises:
@@ -83,7 +83,7 @@ def make_study(
     request = replace(request, policies=policy_files(request.policies))
     errors = Terminal(stderr=True)
     # the folder first: an error in it is shown before anything is played
-    with _own_folder(folder), ProgressDisplay(errors, title) as display:
+    with own_folder(folder), ProgressDisplay(errors, title) as display:
         if lost := lost_policy(folder / data, request.policies):
             raise UserError(f"'{folder}' holds policy {lost}, which would be lost; give another folder with --out")
         results = study(

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -23,6 +23,8 @@ Torque = Annotated[float, Field(strict=True, ge=0.0, le=10_000.0)]
 """[N·m]."""
 Inertia = Annotated[float, Field(strict=True, ge=0.0, le=100.0)]
 """A rotor's inertia, seen at the joint [kg·m²]."""
+_Factor = Annotated[float, Field(strict=True, ge=0.0, le=10.0)]
+_Offset = Annotated[float, Field(strict=True, ge=-1.0, le=1.0)]
 _ActionScale = Annotated[float, Field(ge=0.0, le=100.0)]
 _JointSpeed = Annotated[float, Field(ge=0.0, le=1_000.0)]
 _Names = Annotated[tuple[Text, ...], Field(min_length=1, max_length=1000)]
@@ -35,6 +37,7 @@ class JointParameters:
     The motor law is ``torque = stiffness * (target - q) - damping * qd``, clipped to ``torque_limit`` where the physics
     options ask for torque limits, then multiplied by the motor strength. Where they ask for limits by speed, the torque
     in the direction of motion falls from ``driving_torque_limit`` at ``full_torque_speed`` to zero at ``no_load_speed``.
+    ``commanded`` turns gains that were sent to a measured robot into those that act.
     """
 
     stiffness: tuple[Stiffness, ...]
@@ -55,6 +58,24 @@ class JointParameters:
     """Largest joint speed with the whole driving torque [rad/s]; None where it is not known."""
     no_load_speed: tuple[_JointSpeed, ...] | None = None
     """Joint speed beyond which the motor does not drive [rad/s]; None where it is not known."""
+    stiffness_factor: tuple[_Factor, ...] | None = None
+    """Share of the commanded kp that acts at the joint; None for 1."""
+    damping_factor: tuple[_Factor, ...] | None = None
+    """Share of the commanded kd that acts at the joint; None for 1."""
+    target_offset: tuple[_Offset, ...] | None = None
+    """Angle that the motor adds to its target [rad]: errors of its zero and of the pose; None for 0."""
+    delay: Annotated[float, Field(ge=0.0, le=0.1)] | None = None
+    """Time from sending a target until it acts [s]; None where it was not measured."""
+    measured: Annotated[str, Field(min_length=1, max_length=4000)] | None = None
+    """Provenance of a set that was measured: recordings, method, version. Such a set does not count for the robot's digest."""
+
+    def commanded(self, stiffness: Sequence[float], damping: Sequence[float]) -> JointParameters:
+        """Return the set with the gains that act where these were sent, in the joints' order; both factors are spent."""
+        acting = [
+            tuple(gain * factor for gain, factor in zip(gains, factors or (1.0,) * len(gains), strict=True))
+            for gains, factors in ((stiffness, self.stiffness_factor), (damping, self.damping_factor))
+        ]
+        return replace(self, stiffness=acting[0], damping=acting[1], stiffness_factor=None, damping_factor=None)
 
 
 @dataclass(frozen=True, kw_only=True)

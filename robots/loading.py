@@ -33,6 +33,9 @@ _MOST_ELEMENTS, _MOST_CELLS = 10_000, 4_000_000
 """Most elements of all files, and most points of a height field, a texture or a mesh that MuJoCo makes itself."""
 _CELLS = {"hfield": ("nrow", "ncol"), "texture": ("width", "height"), "mesh": ("params",)}
 _JOINT_ENDING = "_joint"
+PER_JOINT = tuple(f.name for f in fields(JointParameters) if f.name not in ("delay", "measured"))
+"""Fields of a parameter set with a value for each joint."""
+_MEASURED = ("stiffness_factor", "damping_factor", "target_offset", "delay", "measured")
 _ADDED_LATER = ("foot_shapes", "action_scale", "imu_site")
 """Fields that count for a robot's digest only where set, so that digests of older descriptions stay."""
 
@@ -64,7 +67,7 @@ def load_robot_file(path: str | Path) -> Robot:
         sets = data.get("parameters")
         for name, table in sets.items() if isinstance(sets, dict) else ():
             if isinstance(table, dict):
-                _spread(table, [f.name for f in fields(JointParameters)], names, f"{source}: parameters.{name}")
+                _spread(table, PER_JOINT, names, f"{source}: parameters.{name}")
     elif isinstance(names, list):
         raise RobotError(f"{source}: joint_names must hold names, each once")
     if isinstance(data.get("mjcf"), str):
@@ -72,6 +75,20 @@ def load_robot_file(path: str | Path) -> Robot:
     robot = build(Robot, data, source, RobotError)
     _check(robot, source)
     return robot
+
+
+def parameter_set(robot: Robot, table: Any, source: str) -> JointParameters:
+    """Return a ``[parameters.NAME]`` table of another file as a parameter set of the robot; raise ``RobotError`` where it is wrong."""
+    if not isinstance(table, dict):
+        raise RobotError(f"{source} is {shown(table)}; it must be a table")
+    table = dict(table)
+    _spread(table, PER_JOINT, list(robot.joint_names), source)
+    found = build(JointParameters, table, source, RobotError)
+    for key in PER_JOINT:
+        if (value := getattr(found, key)) is not None and len(value) != robot.num_joints:
+            raise RobotError(f"{source}: {key} has {len(value)} values but there are {robot.num_joints} joints")
+    _check_motors(found, robot.joint_names, f"{source}: ")
+    return found
 
 
 def checked_fields(robot: Robot, source: str) -> Robot:
@@ -84,10 +101,17 @@ def checked_fields(robot: Robot, source: str) -> Robot:
 def robot_digest(robot: Robot) -> str:
     """Return the SHA-256, hexadecimal, over the description, the MuJoCo model and all files that the model includes.
 
+    Parameter sets that were measured do not count: they say how one machine moves, and results that use one record it.
+
     Raises:
         RobotError: a file cannot be read.
     """
     description = {k: v for k, v in asdict(robot).items() if k != "mjcf" and not (v is None and k in _ADDED_LATER)}
+    description["parameters"] = {
+        name: {k: v for k, v in table.items() if not (v is None and k in _MEASURED)}
+        for name, table in description["parameters"].items()
+        if table["measured"] is None
+    }
     try:
         return digest(model_files(robot.mjcf), json_text(description))
     except OSError as error:
@@ -266,7 +290,7 @@ def _check(robot: Robot, source: str) -> None:
     if robot.action_scale is not None:
         per_joint["action_scale"] = robot.action_scale
     for name, constants in robot.parameters.items():
-        per_joint |= {f"parameters.{name}.{k}": v for k, v in vars(constants).items() if v is not None}
+        per_joint |= {f"parameters.{name}.{k}": v for k in PER_JOINT if (v := getattr(constants, k)) is not None}
     for key, values in per_joint.items():
         if len(values) != robot.num_joints:
             raise RobotError(f"{source}: {key} has {len(values)} values but there are {robot.num_joints} joints")

@@ -209,14 +209,15 @@ def _check_joints(log: Log, source: str) -> None:
         raise LogError(f"{source}: {where}; the columns do not belong to these joint_names, or it is another robot")
     if np.abs(log.target).max() > 4 * np.pi:
         raise LogError(f"{source}: a target is {np.abs(log.target).max():.1f}; targets must be radians")
-    apart = np.abs(np.median(log.target - log.position, axis=0))
-    worst = int(apart.argmax())
-    if apart[worst] > 1.0:
-        joint = log.robot.joint_names[worst]
-        raise LogError(
-            f"{source}: {joint} is {apart[worst]:.2f} rad away from its target at the median; "
-            "targets and positions are in different orders (target_joints in --map)"
-        )
+    error = log.position[:, :, None] - log.target[:, None, :]
+    apart = np.sqrt((error**2).mean(axis=0))  # of each position from each target
+    own, best = np.diagonal(apart), apart.argmin(axis=1)
+    for j, joint in enumerate(log.robot.joint_names):
+        if own[j] > 0.1 and apart[j, best[j]] < 0.5 * own[j]:
+            raise LogError(
+                f"{source}: {joint} follows the target of {log.robot.joint_names[best[j]]}; "
+                "targets and positions are in different orders (joints and target_joints in --map)"
+            )
 
 
 def joint_ranges(robot: Robot) -> Array:
@@ -226,6 +227,21 @@ def joint_ranges(robot: Robot) -> Array:
     model = mujoco.MjModel.from_xml_path(str(robot.mjcf))
     joints = [model.joint(name) for name in robot.joint_names]
     return np.array([joint.range if model.jnt_limited[joint.id] else (-np.inf, np.inf) for joint in joints])
+
+
+def inverse_torque(robot: Robot, position: Array) -> Array:
+    """Return the torque with which each joint of free legs under an upright, fixed trunk rests at a pose [N·m], (J,)."""
+    import mujoco
+
+    model = mujoco.MjModel.from_xml_path(str(robot.mjcf))
+    model.dof_frictionloss[:] = 0.0
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT.value
+    data = mujoco.MjData(model)
+    joints = [model.joint(name) for name in robot.joint_names]
+    for joint, angle in zip(joints, position, strict=True):
+        data.qpos[joint.qposadr[0]] = angle
+    mujoco.mj_inverse(model, data)
+    return np.array([data.qfrc_inverse[joint.dofadr[0]] for joint in joints])
 
 
 def save_log(log: Log, path: Any) -> None:

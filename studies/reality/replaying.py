@@ -1,0 +1,223 @@
+"""Logs played again by parameter sets and engines, side by side: ``replay.json`` and ``replay.html``."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...backends.registry import choose_device, find_backend
+from ...files.choices import cpu_threads
+from ...files.provenance import provenance
+from ...files.writing import json_text, write_files
+from ...robots import JointParameters
+from .log import Log, LogError, inverse_torque
+from .page import render_page, traces
+from .readers import read_log, read_map
+from .request import LogOptions, ReplayRequest
+from .residuals import differences, joint_groups, noise, repeatability, summarize
+from .rig import FixedRig, Motion, acting_parameters, at_rows, beginning, held_targets, num_steps, play
+from .sets import find_set
+
+Watch = Callable[[int, int, str], None]
+LONGEST_DELAY = 0.03
+"""Largest delay that is fitted [s]."""
+
+
+def read_logs(paths: Sequence[Path], options: LogOptions) -> list[Log]:
+    """Read logs, all of one robot, cut as asked.
+
+    Raises:
+        LogError: a log that cannot be used, or logs of several robots.
+        RobotError: no such robot.
+    """
+    if not paths:
+        raise LogError("no log was given; name one or more files")
+    mapping = None if options.mapping is None else read_map(options.mapping)
+    logs = [read_log(path, robot=options.robot, mapping=mapping, held=options.held) for path in paths]
+    if len({log.robot.name for log in logs}) > 1:
+        names = " and ".join(sorted({log.robot.name for log in logs}))
+        raise LogError(f"the logs are of several robots, {names}; replay them one robot at a time")
+    if options.begin or options.end is not None:
+        logs = [log.cut(options.begin, np.inf if options.end is None else options.end) for log in logs]
+    return logs
+
+
+def hung_or_standing(log: Log) -> Log:
+    """Return the log with ``held`` decided: as it says, hung where it says nothing.
+
+    Raises:
+        LogError: the robot walked, or a log that says hung shows legs that carry a robot.
+    """
+    if log.held == "walking":
+        raise LogError(f"log '{log.name}' is of a walking robot; a replay needs one that hung or stood (--held)")
+    log = replace(log, held=log.held or "hung")
+    if log.held == "hung":
+        _check_hung(log)
+    return log
+
+
+def _check_hung(log: Log) -> None:
+    """Refuse a log of a robot on its feet: its motors give torques that free legs do not need, or its trunk moves."""
+    if log.angular_velocity is not None and (turning := float(np.sqrt((log.angular_velocity**2).sum(1).mean()))) > 0.5:
+        raise LogError(
+            f"log '{log.name}' is replayed as hung, but its trunk turns at {turning:.1f} rad/s; it looks like a walking robot's"
+        )
+    error = log.target - log.position
+    asked = np.median(log.stiffness * error, axis=0)
+    free = inverse_torque(log.robot, np.median(log.position, axis=0))
+    beyond = np.abs(asked - free)
+    group, joints = max(joint_groups(log.robot).items(), key=lambda item: float(beyond[item[1]].mean()))
+    limit = 0.15 * np.asarray(log.robot.parameters[log.robot.default_parameters].torque_limit)[joints].mean()
+    if (most := float(beyond[joints].mean())) > limit:
+        raise LogError(
+            f"log '{log.name}' is replayed as hung, but its {group} motors hold {most:.1f} N·m more than free legs need; it looks "
+            "like a robot on its feet (--held standing), or the gains in the log are not those that were sent"
+        )
+
+
+def replay(
+    request: ReplayRequest, folder: Path, *, command: Sequence[str] = (), watch: Watch = lambda *_: None
+) -> dict[str, Any]:
+    """Replay logs with each parameter set in each engine; return the content of ``replay.json`` (docs/guides/real-robot.md).
+
+    Raises:
+        LogError: a log that cannot be used.
+        BackendError, RobotError: no such engine, device, robot or parameter set.
+    """
+    began = time.perf_counter()
+    logs = [hung_or_standing(log) for log in read_logs(request.logs, request)]
+    robot = logs[0].robot
+    sets = dict(find_set(robot, name) for name in request.parameters or (None,))
+    engines = {name: choose_device(name, request.device) for name in request.backends or ("mujoco",)}
+    for name, device in engines.items():
+        find_backend(name, device)
+    variants = [(f"{s} in {e}" if len(engines) > 1 else s, s, e) for e in engines for s in sets]
+    entries, pictures = [], []
+    for number, log in enumerate(logs):
+        check_torque(log)
+        motions: dict[str, Motion] = {}
+        reference = None
+        rows = []
+        for turn, (label, name, engine) in enumerate(variants):
+            watch(number * len(variants) + turn + 1, len(logs) * len(variants), f"{log.name}: {label}")
+            parameters, fitted = sets[name], None
+            if request.fit_delay and parameters.delay is not None:
+                fitted = fit_delay(log, parameters, threads=cpu_threads(request.threads))
+            delay = parameters.delay or 0.0 if fitted is None else fitted
+            motions[label] = play(log, parameters, engine=engine, device=engines[engine], delay=delay)
+            figures, squares = summarize(log, motions[label], reference)
+            reference = reference or squares
+            rows.append(
+                {
+                    "label": label,
+                    "parameters": name,
+                    "engine": engine,
+                    "delay": delay,
+                    "delay_fitted": fitted is not None,
+                    **figures,
+                }
+            )
+        entries.append(_about(log, logs, rows))
+        pictures.append(traces(log, motions, {label: differences(log, motion) for label, motion in motions.items()}))
+    results = {
+        "schema": 1,
+        "robot": robot.name,
+        "logs": entries,
+        "refused": [],
+        "provenance": provenance(
+            command=command, threads=cpu_threads(request.threads), seconds=round(time.perf_counter() - began, 2)
+        ),
+    }
+    write_files(folder, {"replay.json": json_text(results), "replay.html": render_page(results, pictures)}, LogError)
+    return results
+
+
+def _about(log: Log, logs: Sequence[Log], rows: list[dict[str, Any]]) -> dict[str, Any]:
+    groups = joint_groups(log.robot)
+    again = next((other for other in logs if other is not log and repeatability(log, other, [0]) is not None), None)
+    floor = {g: noise(log, j) if again is None else repeatability(log, again, j) for g, j in groups.items()}
+    return {
+        "name": log.name,
+        "held": log.held,
+        "seconds": float(log.time[-1]),
+        "defects": log.defects(),
+        "notes": list(log.notes),
+        "stiffness": log.stiffness.tolist(),
+        "damping": log.damping.tolist(),
+        "floor": {"of": "noise" if again is None else f"repetition in {again.name}", "groups": floor},
+        "variants": rows,
+    }
+
+
+def check_torque(log: Log) -> None:
+    """Refuse a log whose recorded torques follow other gains than those that it says were sent.
+
+    Raises:
+        LogError: the median over the joints of the acting share of kp is below 0.5 or above 1.6.
+    """
+    if log.torque is None:
+        return
+    shares = []
+    speed = log.velocity if log.velocity is not None else np.gradient(log.position, log.time, axis=0)
+    for lag in range(8):
+        rows = slice(lag, None), slice(None, len(log.time) - lag)
+        error = log.target[rows[1]] - log.position[rows[0]]
+        found = []
+        for j in range(log.target.shape[1]):
+            columns = np.stack([error[:, j], -speed[rows[0]][:, j], np.ones(len(error))], axis=1)
+            solution, residual, *_ = np.linalg.lstsq(columns, log.torque[rows[0]][:, j], rcond=None)
+            found.append((float(residual[0]) if len(residual) else np.inf, solution[0] / max(log.stiffness[j], 1e-9)))
+        shares.append((sum(r for r, _ in found), float(np.median([s for _, s in found]))))
+    share = min(shares)[1]
+    if not 0.5 <= share <= 1.6:
+        kp = float(np.median(log.stiffness))
+        raise LogError(
+            f"log '{log.name}' says that kp was {kp:g} N·m/rad, but its torques follow {share * kp:.3g}; "
+            "correct the gains (stiffness and damping in --map)"
+        )
+
+
+def fit_delay(log: Log, parameters: JointParameters, *, threads: int = 2) -> float:
+    """Return the delay with which a hung robot's positions are nearest to the log [s]: the mean over joints of the logarithm of
+    their RMS error is least.
+
+    Raises:
+        LogError: the log is of a standing robot.
+    """
+    if log.held == "standing":
+        raise LogError(f"log '{log.name}' is of a standing robot; a delay is fitted on a robot that hangs")
+    rig = FixedRig(log.robot, parameters, threads=threads)
+    try:
+        return _fit_delay(rig, log, parameters)
+    finally:
+        rig.close()
+
+
+def _fit_delay(rig: FixedRig, log: Log, parameters: JointParameters) -> float:
+    from scipy.optimize import minimize_scalar
+
+    acting, start, steps = acting_parameters(log, parameters), beginning(log), num_steps(log)
+    offset = np.asarray(parameters.target_offset or 0.0)
+    counted = log.fresh & (log.time >= 0.1)
+
+    def costs(delays: Sequence[float]) -> list[float]:
+        targets = np.stack([held_targets(log, delay, steps) for delay in delays]) + offset
+        series = rig.run([acting] * len(delays), targets, [start] * len(delays))
+        error = at_rows(log, series[0])[:, counted] - log.position[counted]
+        return list(np.log((error**2).mean(axis=1)).mean(axis=1))
+
+    coarse = np.arange(0.0, LONGEST_DELAY, 0.003)
+    best = float(coarse[int(np.argmin(costs(coarse.tolist())))])
+    bounds = max(best - 0.003, 0.0), best + 0.003
+    found = minimize_scalar(lambda d: costs([float(d)])[0], bounds=bounds, method="bounded", options={"xatol": 5e-5})
+    return float(found.x)
+
+
+def label_of(entry: Mapping[str, Any]) -> str:
+    """Return a replay's label with its delay, for tables."""
+    return f"{entry['label']}, delay {1e3 * entry['delay']:.1f} ms" if entry["delay"] else str(entry["label"])
