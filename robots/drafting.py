@@ -159,7 +159,9 @@ def _standing_motors(
     height, stances = survey.feet_depth(), []
     for stiffer in _STIFFER:
         motors = first if stiffer == 1.0 else survey.motors(joints, length, stiffer)
-        constants = {key: tuple(np.broadcast_to(value, len(joints)).tolist()) for key, (value, _) in motors.items()}
+        constants: dict[str, Any] = {
+            key: tuple(np.broadcast_to(value, len(joints)).tolist()) for key, (value, _) in motors.items()
+        }
         stances.append(stand_still(survey.spec.copy(), angles, JointParameters(**constants), height))
         if stances[-1].stands(lowest=_LOWEST, most_tilt=_MOST_TILT):
             if stiffer > 1.0:

@@ -77,7 +77,7 @@ class Log:
                 f"log '{self.name}' has {int(rows.sum())} rows from {begin:g} s to {end:g} s; {_LEAST_ROWS} are needed"
             )
         series = ("time", "target", "position", "velocity", "torque", "quaternion", "angular_velocity", "fresh")
-        parts = {key: None if (value := getattr(self, key)) is None else value[rows] for key in series}
+        parts: dict[str, Any] = {key: None if (value := getattr(self, key)) is None else value[rows] for key in series}
         return replace(self, **parts | {"time": parts["time"] - parts["time"][0]})
 
     def defects(self) -> str:
@@ -248,7 +248,8 @@ def save_log(log: Log, path: Any) -> None:
     """Write a log in the project's own format (``docs/reference/logs.md``), compressed."""
     from ...files.writing import replacing
 
-    optional = ("velocity", "torque", "quaternion", "angular_velocity", "held")
+    keys = ("velocity", "torque", "quaternion", "angular_velocity", "held")
+    optional: dict[str, Any] = {key: value for key in keys if (value := getattr(log, key)) is not None}
     with replacing(path, LogError, ending=".npz") as partial:
         np.savez_compressed(
             partial,
@@ -260,5 +261,5 @@ def save_log(log: Log, path: Any) -> None:
             position=log.position,
             stiffness=log.stiffness,
             damping=log.damping,
-            **{key: np.asarray(value) for key in optional if (value := getattr(log, key)) is not None},
+            **optional,
         )

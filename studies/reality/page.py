@@ -45,7 +45,7 @@ def traces(log: Log, motions: Mapping[str, Motion], errors: Mapping[str, Mapping
         lines = {"recorded": log.position[rows, worst]} | {k: m.position[rows, worst] for k, m in motions.items()}
         motion = _chart(log.time[rows], lines, "position [rad]", "time [s]")
         sliding = {label: _sliding(log, e["position"][:, joints]) for label, e in errors.items()}
-        times = (np.arange(len(next(iter(sliding.values())))) + 0.5) * _WINDOW
+        times = np.array([(i + 0.5) * _WINDOW for i in range(len(next(iter(sliding.values()))))])
         in_time = _chart(
             times, {k: 1e3 * v for k, v in sliding.items()}, "RMS difference [mrad]", "time [s]", zero=True
         )

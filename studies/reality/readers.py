@@ -218,8 +218,8 @@ def _read_npz(path: Path, mapping: LogMap, source: str) -> _Raw:
         if key in data:
             columns[key] = _numbers(data[key], key, source)
     _check_shapes(columns, len(names), source)
-    text = {key: str(data[key].item()) for key in ("robot", "held") if key in data and data[key].size == 1}
-    return _Raw(columns=columns, joints=names, target_joints=mapping.target_joints or names, **text)
+    robot, held = (str(data[key].item()) if key in data and data[key].size == 1 else None for key in ("robot", "held"))
+    return _Raw(columns=columns, joints=names, target_joints=mapping.target_joints or names, robot=robot, held=held)
 
 
 def _numbers(value: Any, key: str, source: str) -> NDArray[np.float64]:

@@ -390,7 +390,7 @@ def joint_parameters(robot: Robot, configuration: EnvironmentConfiguration) -> J
         raise ConfigurationError(
             f"environment.joints.parameters is '{settings.parameters}', but robot '{robot.name}' has: {known}"
         )
-    changed = {
+    changed: dict[str, Any] = {
         name: (value,) * robot.num_joints
         for name in ("armature", "joint_damping", "friction_loss")
         if (value := getattr(settings, name)) is not None
