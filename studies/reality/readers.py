@@ -360,7 +360,7 @@ def _quaternion(angles: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _read_mcap(path: Path, mapping: LogMap, source: str) -> _Raw:
-    """Read an MCAP file: JSON messages, or ROS 2 messages where ``mcap-ros2-support`` is installed."""
+    """Read an MCAP file: JSON or ROS 2 messages."""
     try:
         from mcap.exceptions import McapError
         from mcap.reader import make_reader
@@ -413,7 +413,7 @@ def _decoded(schema: Any, channel: Any, data: bytes, source: str) -> Any:
         try:
             from mcap_ros2.decoder import DecoderFactory
         except ImportError as problem:
-            lacking = "its messages are ROS 2's; install their reader with: pip install mcap-ros2-support"
+            lacking = "its messages are ROS 2's; install their reader with: pip install 'gaitgauge[mcap]'"
             raise LogError(f"{source}: {lacking}") from problem
         decode = DecoderFactory().decoder_for(channel.message_encoding, schema)
         if decode is not None:

@@ -19,7 +19,13 @@ ROOT = Path(gaitgauge.__path__[0])
 TOP = ("backends", "cli", "files", "gauge", "policy", "robots", "studies", "terrains", "training")
 
 
-PARTS = {"google": "protobuf", "pydantic_core": "pydantic", "pygame": "pygame-ce", "pydrake": "drake"}
+PARTS = {
+    "google": "protobuf",
+    "pydantic_core": "pydantic",
+    "pygame": "pygame-ce",
+    "pydrake": "drake",
+    "mcap_ros2": "mcap-ros2-support",
+}
 """Who provides a module, where that is not told by what is installed."""
 
 
@@ -49,7 +55,7 @@ def imported() -> dict[str, str]:
 def test_what_is_imported_is_asked_for_and_nothing_else():
     listed, extras = project()["project"]["dependencies"], project()["project"]["optional-dependencies"]
     asked = {distribution(text) for text in listed}
-    optional = {distribution(text) for name in ("gamepad", "cluster", "drake") for text in extras[name]}
+    optional = {distribution(text) for name in ("gamepad", "cluster", "drake", "mcap") for text in extras[name]}
     found = imported()
     assert {name: file for name, file in found.items() if name not in asked | optional} == {}
     assert asked - found.keys() == set()
