@@ -14,16 +14,6 @@ from .base import (
 from .registry import backend_class, backend_names, make_backend
 
 __all__ = [
-    "BackendError",
-    "Capability",
-    "PhysicsBackend",
-    "PhysicsOptions",
-    "PhysicsState",
-    "Randomization",
-    "ResetState",
-    "Scene",
-    "Support",
-    "backend_class",
-    "backend_names",
-    "make_backend",
-]
+    "BackendError", "Capability", "PhysicsBackend", "PhysicsOptions", "PhysicsState", "Randomization", "ResetState",
+    "Scene", "Support", "backend_class", "backend_names", "make_backend",
+]  # fmt: skip

@@ -9,13 +9,6 @@ from .check import Check
 from .suite import CheckResult, Outcome, all_checks, make_bench, run_check, run_conformance
 
 __all__ = [
-    "Bench",
-    "Check",
-    "CheckResult",
-    "ConformanceError",
-    "Outcome",
-    "all_checks",
-    "make_bench",
-    "run_check",
+    "Bench", "Check", "CheckResult", "ConformanceError", "Outcome", "all_checks", "make_bench", "run_check",
     "run_conformance",
-]
+]  # fmt: skip

@@ -157,23 +157,10 @@ def list_prisms(shapes: Shapes, lists: Lists, warn: bool) -> None:
     if shapes.geom_type[geoms[0]] != int(GeomType.HFIELD) or kind < int(GeomType.SPHERE) or kind > int(GeomType.MESH):
         return
     apart, x_min, x_max, y_min, y_max, z_min, _ = field_filter(
-        shapes.geom_type,
-        shapes.geom_dataid,
-        shapes.geom_size,
-        shapes.geom_rbound,
-        shapes.geom_margin,
-        shapes.mesh_vertadr,
-        shapes.mesh_vertnum,
-        shapes.mesh_graphadr,
-        shapes.mesh_vert,
-        shapes.mesh_graph,
-        shapes.hfield_size,
-        shapes.geom_xpos,
-        shapes.geom_xmat,
-        world,
-        geoms[0],
-        geoms[1],
-    )
+        shapes.geom_type, shapes.geom_dataid, shapes.geom_size, shapes.geom_rbound, shapes.geom_margin,
+        shapes.mesh_vertadr, shapes.mesh_vertnum, shapes.mesh_graphadr, shapes.mesh_vert, shapes.mesh_graph,
+        shapes.hfield_size, shapes.geom_xpos, shapes.geom_xmat, world, geoms[0], geoms[1],
+    )  # fmt: skip
     if apart:
         return
     margin, _ = margin_gap(shapes, pair)
@@ -217,15 +204,9 @@ def list_prisms(shapes: Shapes, lists: Lists, warn: bool) -> None:
 def listed_prism(shapes: Shapes, pair: int, number: int, margin: float) -> mat63:
     """Return a prism of a pair's field, lifted by the margin."""
     field = field_of(shapes, pair)
-    return prism_of(
-        shapes.hfield_data,
-        shapes.hfield_adr[field],
-        shapes.hfield_ncol[field],
-        shapes.hfield_nrow[field],
-        shapes.hfield_size[field],
-        number,
-        margin,
-    )
+    start, size = shapes.hfield_adr[field], shapes.hfield_size[field]
+    columns, rows = shapes.hfield_ncol[field], shapes.hfield_nrow[field]
+    return prism_of(shapes.hfield_data, start, columns, rows, size, number, margin)
 
 
 @wp.func
@@ -233,29 +214,12 @@ def in_field_frame(shapes: Shapes, pair: int, kind: int, margin: float):
     """Return the geoms of a pair for mujoco_warp's functions, in the field's frame, without the prism."""
     geoms, world = shapes.collision_pair[pair], shapes.collision_worldid[pair]
     field, shape = geom_collision_pair_from_types(
-        shapes.geom_dataid,
-        shapes.geom_size,
-        shapes.mesh_vertadr,
-        shapes.mesh_vertnum,
-        shapes.mesh_graphadr,
-        shapes.mesh_vert,
-        shapes.mesh_graph,
-        shapes.mesh_polynum,
-        shapes.mesh_polyadr,
-        shapes.mesh_polynormal,
-        shapes.mesh_polyvertadr,
-        shapes.mesh_polyvertnum,
-        shapes.mesh_polyvert,
-        shapes.mesh_polymapadr,
-        shapes.mesh_polymapnum,
-        shapes.mesh_polymap,
-        shapes.geom_xpos,
-        shapes.geom_xmat,
-        int(GeomType.HFIELD),
-        kind,
-        geoms,
-        world,
-    )
+        shapes.geom_dataid, shapes.geom_size, shapes.mesh_vertadr, shapes.mesh_vertnum, shapes.mesh_graphadr,
+        shapes.mesh_vert, shapes.mesh_graph, shapes.mesh_polynum, shapes.mesh_polyadr, shapes.mesh_polynormal,
+        shapes.mesh_polyvertadr, shapes.mesh_polyvertnum, shapes.mesh_polyvert,
+        shapes.mesh_polymapadr, shapes.mesh_polymapnum, shapes.mesh_polymap,
+        shapes.geom_xpos, shapes.geom_xmat, int(GeomType.HFIELD), kind, geoms, world,
+    )  # fmt: skip
     into = wp.transpose(field.rot)
     shape.pos = into @ (shape.pos - field.pos)
     shape.rot = into @ shape.rot
@@ -353,27 +317,15 @@ def prism_kernels(kinds: tuple[int, ...]) -> tuple[wp.Kernel, wp.Kernel]:
             field, shape = in_field_frame(shapes, pair, kind, margin)
             prism = listed_prism(shapes, pair, search[1], margin)
             field.polyvert = prism
+            tolerance = shapes.ccd_tolerance[world % shapes.ccd_tolerance.shape[0]]
+            middle = (prism[0] + prism[1] + prism[2] + prism[3] + prism[4] + prism[5]) * (1.0 / 6.0)
             distance, found, first, second, _index = ccd(
-                shapes.ccd_tolerance[world % shapes.ccd_tolerance.shape[0]],
-                0.0,
-                gjk_iterations,
-                epa_iterations,
-                field,
-                shape,
-                int(GeomType.HFIELD),
-                kind,
-                (prism[0] + prism[1] + prism[2] + prism[3] + prism[4] + prism[5]) * (1.0 / 6.0),
-                shape.pos,
-                scratch.vertices[worker],
-                scratch.vertex_numbers[worker],
-                scratch.faces[worker],
-                scratch.projections[worker],
-                scratch.squares[worker],
-                scratch.horizon[worker],
-                warn_horizon,
-                world,
-                shapes.overflow,
-            )
+                tolerance, 0.0, gjk_iterations, epa_iterations,
+                field, shape, int(GeomType.HFIELD), kind, middle, shape.pos,
+                scratch.vertices[worker], scratch.vertex_numbers[worker], scratch.faces[worker],
+                scratch.projections[worker], scratch.squares[worker], scratch.horizon[worker],
+                warn_horizon, world, shapes.overflow,
+            )  # fmt: skip
             if found == 0:
                 distance = wp.inf
             lists.touches[search[2]] = touch_of(shapes, pair, distance, first, second)
