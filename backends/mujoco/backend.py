@@ -267,7 +267,10 @@ class MujocoBackend(PhysicsBackend):
         records = self._memory(len(others), control.shape[1])[1]
         if len(others):
             self._play(others, some, records)
-        return _merge(limp, records, loose)
+        merged = {name: np.empty((len(limp), *array.shape[1:])) for name, array in loose.items()}
+        for name, array in merged.items():
+            array[limp], array[~limp] = loose[name], records[name]
+        return merged
 
     def _play_singly(self, rows: NDArray[np.int64], control: Array, loose: NDArray[np.bool_]) -> Records:
         """Step worlds as ``_play`` does, substep by substep, with targets that follow the state.
@@ -304,7 +307,7 @@ class MujocoBackend(PhysicsBackend):
         exceeded = False
         for name, over in seen.items():
             some = bool(over.any())
-            self._state.flags[name][those] = _first(over) if some else 0
+            self._state.flags[name][those] = np.where(over.any(1), over.argmax(1) + 1, 0) if some else 0
             exceeded |= some
         return exceeded
 
@@ -340,12 +343,11 @@ class MujocoBackend(PhysicsBackend):
                 if name not in known or not np.array_equal(known[name], entry):
                     known[name] = entry
                     changed.add(row)
-        if not changed:
-            return
         for row in changed:
             self._apply_randomization(row)
         self._read_gains(sorted(changed))
-        self._batch.set_models(self._models)
+        if changed:
+            self._batch.set_models(self._models)
 
     def _apply_randomization(self, row: int) -> None:
         """Write a world's randomization into its model, starting from its terrain's nominal values."""
@@ -401,16 +403,14 @@ class MujocoBackend(PhysicsBackend):
         rows = self._rows(worlds)
         for first, value in ((0, linear_velocity_w), (3, angular_velocity_b)):
             if value is not None:
-                new = value.numpy()[rows]
-                old = self._qvel[rows, first : first + 3]
-                self._qvel[rows, first : first + 3] = np.where(np.isnan(new), old, new)
+                new, columns = value.numpy()[rows], slice(first, first + 3)
+                self._qvel[rows, columns] = np.where(np.isnan(new), self._qvel[rows, columns], new)
         self._batch.forward(rows.astype(np.int32), stage=_STAGE)
 
     def apply_force(self, force_w: torch.Tensor) -> None:
         """See ``PhysicsBackend.apply_force``."""
         check_force(self.scene, force_w)
-        applied = self._applied.reshape(self.num_worlds, -1, 6)
-        applied[:, self._base, 0:3] = force_w.numpy()
+        self._applied.reshape(self.num_worlds, -1, 6)[:, self._base, 0:3] = force_w.numpy()
 
     def describe(self) -> Mapping[str, list[float]]:
         """See ``PhysicsBackend.describe``."""
@@ -419,18 +419,3 @@ class MujocoBackend(PhysicsBackend):
     def close(self) -> None:
         """Drop the worlds."""
         self._models.clear()
-
-
-def _first(over: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Return the position (1-based) of the first true entry of each row, 0 where there is none."""
-    return np.where(over.any(1), over.argmax(1) + 1, 0)
-
-
-def _merge(limp: NDArray[np.bool_], others: Records, records: Records) -> Records:
-    """Return records of limp and other worlds in their common order."""
-    merged = {}
-    for name in RECORDED:
-        merged[name] = np.empty((len(limp), *records[name].shape[1:]))
-        merged[name][limp] = records[name]
-        merged[name][~limp] = others[name]
-    return merged

@@ -32,18 +32,14 @@ def robot_spec(scene: Scene) -> mujoco.MjSpec:
     robot, physics, constants = scene.robot, scene.physics, scene.parameters
     spec = mujoco.MjSpec.from_file(str(robot.mjcf))
     option = spec.option
-    option.timestep = physics.timestep
+    for name in ("timestep", "impratio", "iterations", "ls_iterations", "tolerance"):
+        setattr(option, name, getattr(physics, name))
     option.integrator = mujoco.mjtIntegrator.mjINT_EULER
     if physics.cone not in ("elliptic", "pyramidal"):
         use = "use 'elliptic' or 'pyramidal' (PhysicsOptions.cone)"
         raise BackendError(f"friction cone '{physics.cone}' does not exist; {use}")
-    elliptic = physics.cone == "elliptic"
-    option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC if elliptic else mujoco.mjtCone.mjCONE_PYRAMIDAL
-    option.impratio = physics.impratio
+    option.cone = getattr(mujoco.mjtCone, f"mjCONE_{physics.cone.upper()}")
     option.solver = mujoco.mjtSolver.mjSOL_NEWTON
-    option.iterations = physics.iterations
-    option.ls_iterations = physics.ls_iterations
-    option.tolerance = physics.tolerance
     for j, name in enumerate(robot.joint_names):
         joint = spec.joint(name)
         if joint is None:
