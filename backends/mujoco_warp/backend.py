@@ -24,7 +24,7 @@ from ..warp.state import StateArrays
 from ..warp.structures import filled, to_warp
 from . import kernels, readout
 from .alarms import DROPPED
-from .arrays import Links, Palette, Roles, contact_arrays, motion_arrays
+from .arrays import Links, Motion, Palette, Roles, contact_arrays, motion_arrays
 from .masses import BATCHED_FIELDS, WorldMasses, describe_model
 from .memory import bytes_per_world
 from .model import SMALLEST_TOLERANCE, Capacity, SharedModel, buffer_capacity, build_shared_model
@@ -104,14 +104,13 @@ class MujocoWarpBackend(WarpBackend):
             # called between collision detection and constraints, and between constraints and solver
             self._model.callback.contactfilter = lambda _, data: self._order.sort_contacts(data)
             self._model.callback.control = lambda _, data: self._order.sort_rows(data)
-        self._kept = self._floats(n, model.nq + 2 * model.nv + 1)
-        self._kept_overflow = self._integers(n)
+        changing = ("qpos", "qvel", "warmstart", "time", "overflow")
+        self._kept = filled(Motion, self._motion, **{n: wp.zeros_like(getattr(self._motion, n)) for n in changing})
         parked = model.qpos0.copy()
         parked[:7] = (0.0, 0.0, PARKED_HEIGHT, 1.0, 0.0, 0.0, 0.0)
         parked[shared.joint_q] = robot.default_joint_position
         self._parked = to_warp(parked, float)
         self._external = wp.to_torch(self._data.xfrc_applied)
-        self._kept_arrays = [wp.from_torch(self._kept), wp.from_torch(self._kept_overflow)]
 
     # ---- launching ------------------------------------------------------------------------------------------------
 
@@ -126,7 +125,6 @@ class MujocoWarpBackend(WarpBackend):
             self._read_torques(select, value, out)
 
     def _place_robots(self) -> None:
-        """See ``WarpBackend``."""
         active, motors = self._active_array, self._motors.arrays
         inputs = [active, self._request_array, *self._reset_arrays, motors, self._motion, self._live]
         wp.launch(kernels.reset_worlds, dim=(self.num_worlds, self._joints), inputs=inputs)
@@ -134,7 +132,6 @@ class MujocoWarpBackend(WarpBackend):
         self._read(active, 1, self._live, forces=False)
 
     def _place_terrain(self) -> None:
-        """See ``WarpBackend``."""
         model, data, slots = self._model, self._data, len(self._shared.slot_geom)
         asked = [self._active_array, self._new_terrain_array, len(self.scene.terrains), slots]
         tables = [self._slot_geom, self._palette, self._terrain_array]
@@ -148,9 +145,9 @@ class MujocoWarpBackend(WarpBackend):
         n, data, motors, motion, live = self.num_worlds, self._data, self._motors.arrays, self._motion, self._live
         active, each_joint = self._active_array, (n, self._joints)
         depth, positions = self.scene.physics.watch_penetration, (n, self._motion.positions)
-        keep = [self._parked, motion, *self._kept_arrays]
         wp.launch(kernels.begin_period, dim=each_joint, inputs=[active, self._request_array, motors, live])
-        wp.launch(kernels.keep_inactive, dim=positions, inputs=[active, 0, *keep])
+        wp.launch(kernels.copy_inactive, dim=positions, inputs=[active, motion, self._kept])
+        wp.launch(kernels.park_inactive, dim=n, inputs=[active, self._parked, motion])
         for substep in range(total):
             wp.launch(kernels.motor_law, dim=each_joint, inputs=[substep, motors, motion])
             mujoco_warp.step(self._model, data)
@@ -161,11 +158,10 @@ class MujocoWarpBackend(WarpBackend):
                 wp.launch(kernels.watch_penetration, dim=data.naconmax, inputs=[substep, depth, active, *tables, live])
             if sampled:
                 self._read(self._sample_array, substep + 1, self._sampled, forces=True)
-        wp.launch(kernels.keep_inactive, dim=positions, inputs=[active, 1, *keep])
+        wp.launch(kernels.copy_inactive, dim=positions, inputs=[active, self._kept, motion])
         self._read(active, 1, live, forces=True)
 
     def _push_base(self) -> None:
-        """See ``WarpBackend``."""
         inputs = [self._active_array, self._twist_array, self._motion]
         wp.launch(kernels.push_base, dim=(self.num_worlds, 6), inputs=inputs)
         self._read(self._active_array, 1, self._live, forces=False)
@@ -181,7 +177,7 @@ class MujocoWarpBackend(WarpBackend):
         """See ``PhysicsBackend.randomize``. Fields may also have a row for every world; then the masked rows count."""
         rows = self._changes(randomization, worlds)
         self._write_motors(rows)
-        if self._masses.write(rows, self._active.bool(), self._write):
+        if self._masses.write(rows, self._active.bool()):
             with self._scope():
                 mujoco_warp.set_const(self._model, self._data, restore=False)
 

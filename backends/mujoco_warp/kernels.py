@@ -27,47 +27,44 @@ def begin_period(active: wp.array[int], has_request: wp.array[int], motors: Moto
 
 
 @wp.kernel
-def keep_inactive(
-    active: wp.array[int],
-    restore: int,
-    parked_qpos: wp.array[float],
-    motion: Motion,
-    kept: wp.array2d[float],
-    kept_overflow: wp.array[int],
-) -> None:
-    """Save (or restore) the state of the worlds that must not step, and park their robots out of reach to save collision time."""
+def copy_inactive(active: wp.array[int], source: Motion, target: Motion) -> None:
+    """Copy the state of the worlds that must not step, away before a step and back after it."""
     world, i = wp.tid()
     if active[world] != 0:
         return
-    if restore == 0:
-        if i < motion.positions:
-            kept[world, i] = motion.qpos[world, i]
-            motion.qpos[world, i] = parked_qpos[i]
-        if i < motion.velocities:
-            kept[world, motion.positions + i] = motion.qvel[world, i]
-            kept[world, motion.positions + motion.velocities + i] = motion.warmstart[world, i]
-            motion.qvel[world, i] = 0.0
-            motion.warmstart[world, i] = 0.0
-        if i == 0:
-            kept[world, motion.positions + 2 * motion.velocities] = motion.time[world]
-            kept_overflow[world] = motion.overflow[world]
-    else:
-        if i < motion.positions:
-            motion.qpos[world, i] = kept[world, i]
-        if i < motion.velocities:
-            motion.qvel[world, i] = kept[world, motion.positions + i]
-            motion.warmstart[world, i] = kept[world, motion.positions + motion.velocities + i]
-        if i == 0:
-            motion.time[world] = kept[world, motion.positions + 2 * motion.velocities]
-            motion.overflow[world] = kept_overflow[world]
+    if i < source.positions:
+        target.qpos[world, i] = source.qpos[world, i]
+    if i < source.velocities:
+        target.qvel[world, i] = source.qvel[world, i]
+        target.warmstart[world, i] = source.warmstart[world, i]
+    if i == 0:
+        target.time[world] = source.time[world]
+        target.overflow[world] = source.overflow[world]
+
+
+@wp.func
+def park(world: int, parked_qpos: wp.array[float], motion: Motion) -> None:
+    """Put a robot at rest, out of reach."""
+    for i in range(motion.positions):
+        motion.qpos[world, i] = parked_qpos[i]
+    for i in range(motion.velocities):
+        motion.qvel[world, i] = 0.0
+        motion.warmstart[world, i] = 0.0
+
+
+@wp.kernel
+def park_inactive(active: wp.array[int], parked_qpos: wp.array[float], motion: Motion) -> None:
+    """Park the robots that must not step, to save collision time."""
+    world = wp.tid()
+    if active[world] == 0:
+        park(world, parked_qpos, motion)
 
 
 @wp.kernel
 def motor_law(substep: int, motors: Motors, motion: Motion) -> None:
     """Apply the motor law with the target of this substep (from 0)."""
     world, joint = wp.tid()
-    position = motion.qpos[world, motion.joint_q[joint]]
-    velocity = motion.qvel[world, motion.joint_v[joint]]
+    position, velocity = motion.qpos[world, motion.joint_q[joint]], motion.qvel[world, motion.joint_v[joint]]
     torque = motor_torque(motors, world, joint, substep, position, velocity)
     motors.torque[world, joint] = torque
     motion.applied[world, motion.joint_v[joint]] = torque
@@ -95,15 +92,10 @@ def end_substep(
             valid = False
     if state.diverged[world] or not valid:
         state.diverged[world] = True
-        for i in range(motion.positions):
-            motion.qpos[world, i] = parked_qpos[i]
-        for i in range(motion.velocities):
-            motion.qvel[world, i] = 0.0
-            motion.warmstart[world, i] = 0.0
+        park(world, parked_qpos, motion)
         return
-    upright = 1.0 - 2.0 * (
-        motion.qpos[world, 4] * motion.qpos[world, 4] + motion.qpos[world, 5] * motion.qpos[world, 5]
-    )
+    x, y = motion.qpos[world, 4], motion.qpos[world, 5]
+    upright = 1.0 - 2.0 * (x * x + y * y)
     if upright < upright_limit and state.tilt_substep[world] == wp.int64(0):
         state.tilt_substep[world] = wp.int64(substep + 1)
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
+from typing import Any
 
 import mujoco_warp
 import numpy as np
@@ -39,42 +40,38 @@ class WorldMasses:
         self._others = torch.tensor(others, dtype=torch.int64, device=device)
         self._other_bodies = torch.tensor(shared.bodies[others], dtype=torch.int64, device=device)
 
-    def write(
-        self, rows: Mapping[str, torch.Tensor], mask: torch.Tensor, write: Callable[[torch.Tensor, torch.Tensor], None]
-    ) -> bool:
+    def write(self, rows: Mapping[str, torch.Tensor], mask: torch.Tensor) -> bool:
         """Write fields of a ``Randomization``.
 
         Args:
             rows: one row for every world, by the field's name.
             mask: the worlds to change, (N,) bool.
-            write: writes the masked rows of its second argument into the first.
 
         Returns:
             True where masses changed, so that derived constants must be computed anew.
         """
+
+        def put(target: torch.Tensor, columns: Any, values: torch.Tensor) -> None:
+            where = mask.view(-1, *(1,) * (values.dim() - 1))
+            target[:, columns] = torch.where(where, values, target[:, columns])
+
         if "friction" in rows:
             # in every geom, so that no other coefficient acts by its size or priority
-            write(self._friction[:, :, 0], rows["friction"][:, None].expand(-1, self._friction.shape[1]))
+            put(self._friction[..., 0], slice(None), rows["friction"][:, None])
         if "foot_torsion" in rows:
-            moments = self._nominal_moments * rows["foot_torsion"][:, None, None]
-            self._friction[:, self._feet, 1:] = torch.where(
-                mask[:, None, None], moments, self._friction[:, self._feet, 1:]
-            )
+            put(self._friction[..., 1:], self._feet, self._nominal_moments * rows["foot_torsion"][:, None, None])
         if "foot_softness" in rows:
-            time = self._nominal_time * rows["foot_softness"][:, None]
-            self._reference[:, self._feet, 0] = torch.where(mask[:, None], time, self._reference[:, self._feet, 0])
+            put(self._reference[..., 0], self._feet, self._nominal_time * rows["foot_softness"][:, None])
         base, bodies = self._base, self._other_bodies
         if "link_mass_scale" in rows:
-            scale, column = rows["link_mass_scale"][:, self._others], mask[:, None]
-            mass, inertia = self._mass[:, bodies], self._inertia[:, bodies]
-            self._mass[:, bodies] = torch.where(column, self._nominal_mass[:, bodies] * scale, mass)
-            scaled = self._nominal_inertia[:, bodies] * scale[:, :, None]
-            self._inertia[:, bodies] = torch.where(column[:, :, None], scaled, inertia)
+            scale = rows["link_mass_scale"][:, self._others]
+            put(self._mass, bodies, self._nominal_mass[:, bodies] * scale)
+            put(self._inertia, bodies, self._nominal_inertia[:, bodies] * scale[:, :, None])
         if "base_mass_offset" in rows:
-            mass = (self._nominal_mass[:, base] + rows["base_mass_offset"]).clamp(min=SMALLEST_BASE_MASS)
-            write(self._mass[:, base], mass)
+            mass = self._nominal_mass[:, base] + rows["base_mass_offset"]
+            put(self._mass, base, mass.clamp(min=SMALLEST_BASE_MASS))
         if "base_com_offset" in rows:
-            write(self._com[:, base], self._nominal_com[:, base] + rows["base_com_offset"])
+            put(self._com, base, self._nominal_com[:, base] + rows["base_com_offset"])
         return bool({"link_mass_scale", "base_mass_offset", "base_com_offset"} & set(rows))
 
 
@@ -89,7 +86,7 @@ def describe_model(model: mujoco_warp.Model, shared: SharedModel, motors: MotorT
     limited = shared.model.jnt_limited[joints, None].astype(bool)
     feet = [int(np.flatnonzero(shared.roles["foot"] == f)[0]) for f in range(int(shared.roles["foot"].max()) + 1)]
     floor, priority = shared.model.geom("floor").id, model.geom_priority.numpy()
-    friction, strength = first("geom_friction"), motors.strength[0].cpu().numpy()
+    friction = first("geom_friction")
     return ModelFields(
         total_mass=float(first("body_mass").sum()),
         body_mass=first("body_mass")[bodies],
@@ -98,9 +95,7 @@ def describe_model(model: mujoco_warp.Model, shared: SharedModel, motors: MotorT
         joint_armature=first("dof_armature")[dofs],
         joint_damping=first("dof_damping")[dofs],
         joint_friction_loss=first("dof_frictionloss")[dofs],
-        stiffness=motors.stiffness[0].cpu().numpy() * strength,
-        damping=motors.damping[0].cpu().numpy() * strength,
-        torque_limit=motors.torque_limit.cpu().numpy() * strength,
+        **motors.described(),
         foot_friction=friction[feet, 0],
         floor_friction=float(friction[floor, 0]),
         foot_priority=priority[feet] - priority[floor],

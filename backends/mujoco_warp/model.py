@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from ...terrains.base import Terrain
+from ...terrains.base import HeightField, Terrain
 from ..base import BackendError, PhysicsOptions, Scene
 from ..mujoco.model import robot_spec
 
@@ -79,34 +79,36 @@ def build_shared_model(scene: Scene) -> SharedModel:
     """
     robot = scene.robot
     slots = max((len(t.boxes) for t in scene.terrains), default=0)
-    has_field = any(t.height_field is not None for t in scene.terrains)
+    fields = [t.height_field for t in scene.terrains if t.height_field is not None]
     spec = robot_spec(scene)
     strip(spec)
-    slot_names = _add_slots(spec, scene.terrains, slots)
+    slot_names = _add_slots(spec, fields, slots)
     try:
         model = spec.compile()
     except ValueError as error:
         raise BackendError(f"MuJoCo cannot build the model of robot '{robot.name}': {error}") from error
-    _write_fields(model, scene.terrains)
-    base = _body(model, scene, robot.base_body)
+    for address, field in zip(model.hfield_adr, fields, strict=True):
+        # unchanged, because MuJoCo's compiler shifts every field's lowest node to zero
+        elevation = (field.heights / _top(field.heights)).ravel()
+        model.hfield_data[address : address + len(elevation)] = elevation
+    base = _find(model, scene, "body", robot.base_body)
     free = model.body_jntadr[base]
     if free != 0 or model.jnt_type[free] != mujoco.mjtJoint.mjJNT_FREE:
         raise BackendError(f"body '{robot.base_body}' of robot '{robot.name}' must carry a free joint and come first")
     slot_geom = np.array([model.geom(name).id for name in slot_names], dtype=np.int32)
     geom_slot = np.full(model.ngeom, -1, dtype=np.int32)
     geom_slot[slot_geom] = np.arange(len(slot_geom))
-    bodies = np.array([_body(model, scene, name) for name in robot.collision_bodies], dtype=np.int32)
+    bodies = np.array([_find(model, scene, "body", name) for name in robot.collision_bodies], dtype=np.int32)
     index = {int(b): i for i, b in enumerate(bodies)}
-    trunk = [_geom(model, scene, name) for name in scene.robot.trunk_shapes]
+    trunk = [_find(model, scene, "geom", name) for name in scene.robot.trunk_shapes]
     geom_foot = np.full(model.ngeom, -1, dtype=np.int32)
-    for i, name in enumerate(robot.foot_geoms):
-        geom_foot[_geom(model, scene, name)] = i
+    geom_foot[[_find(model, scene, "geom", name) for name in robot.foot_geoms]] = np.arange(len(robot.foot_geoms))
     return SharedModel(
         model=model,
-        palette=_palette(scene.terrains, slots, has_field),
+        palette=_palette(scene.terrains, slots, bool(fields)),
         links=_links(model, scene, base),
         slot_geom=slot_geom,
-        has_field=has_field,
+        has_field=bool(fields),
         roles={
             "foot": geom_foot,
             "body": np.array([index.get(int(b), -1) for b in model.geom_bodyid], dtype=np.int32),
@@ -160,17 +162,14 @@ def strip(spec: mujoco.MjSpec) -> None:
         spec.delete(element)
 
 
-def _add_slots(spec: mujoco.MjSpec, terrains: tuple[Terrain, ...], slots: int) -> list[str]:
+def _add_slots(spec: mujoco.MjSpec, fields: Sequence[HeightField], slots: int) -> list[str]:
     """Add floor, box slots and height fields; return the names of the slots' geoms, in order."""
     world = spec.worldbody
     world.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0.0, 0.0, 1.0])
     names = [f"box_{i}" for i in range(slots)]
     for name in names:
         world.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_BOX, size=[PARKED_SIZE] * 3, pos=PARKED)
-    fields = [t for t in terrains if t.height_field is not None]
-    for i, terrain in enumerate(fields):
-        field = terrain.height_field
-        assert field is not None
+    for i, field in enumerate(fields):
         hfield = spec.add_hfield(name=f"field_{i}", nrow=field.heights.shape[0], ncol=field.heights.shape[1])
         hfield.size = np.array([*field.half_size, _top(field.heights), field.base])
         hfield.userdata = field.heights.astype(np.float32).ravel()
@@ -183,14 +182,6 @@ def _add_slots(spec: mujoco.MjSpec, terrains: tuple[Terrain, ...], slots: int) -
 def _top(heights: Floats) -> float:
     """Return the height of the engine's unit elevation [m]."""
     return max(float(heights.max()), 1e-6)
-
-
-def _write_fields(model: mujoco.MjModel, terrains: tuple[Terrain, ...]) -> None:
-    """Write elevations unchanged, because MuJoCo's compiler shifts every field's lowest node to zero."""
-    fields = [t.height_field for t in terrains if t.height_field is not None]
-    for i, field in enumerate(fields):
-        address, size = model.hfield_adr[i], field.heights.size
-        model.hfield_data[address : address + size] = (field.heights / _top(field.heights)).ravel()
 
 
 def _palette(terrains: tuple[Terrain, ...], slots: int, has_field: bool) -> Tables:
@@ -206,10 +197,8 @@ def _palette(terrains: tuple[Terrain, ...], slots: int, has_field: bool) -> Tabl
     for i, terrain in enumerate(terrains):
         for k, box in enumerate(terrain.boxes):
             position[i, k] = box.center
-            matrix = np.zeros(9)
-            quaternion = np.asarray(box.quaternion) / np.linalg.norm(box.quaternion)
-            mujoco.mju_quat2Mat(matrix, quaternion)
-            rotation[i, k] = matrix.reshape(3, 3)
+            turn = np.asarray(box.quaternion) / np.linalg.norm(box.quaternion)
+            mujoco.mju_quat2Mat(rotation[i, k].reshape(9), turn)  # a view
             size[i, k] = half[i, k] = box.half_size
             radius[i, k] = np.linalg.norm(box.half_size)
             wall[i, k] = box.wall
@@ -233,7 +222,7 @@ def _links(model: mujoco.MjModel, scene: Scene, base: int) -> Tables:
     feet: list[Floats] = []
     unit = np.array([1.0, 0.0, 0.0, 0.0])
     for name in scene.robot.foot_geoms:
-        geom = _geom(model, scene, name)
+        geom = _find(model, scene, "geom", name)
         feet.append(model.geom_pos[geom].copy())
         chain: list[int] = []
         body = int(model.geom_bodyid[geom])
@@ -245,8 +234,7 @@ def _links(model: mujoco.MjModel, scene: Scene, base: int) -> Tables:
             body = int(model.body_parentid[body])
         for body in reversed(chain):
             first, number = int(model.body_jntadr[body]), int(model.body_jntnum[body])
-            joints = [first + i for i in range(number)] or [-1]
-            for i, joint in enumerate(joints):
+            for i, joint in enumerate(range(first, first + number) or [-1]):
                 if joint >= 0 and model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_HINGE:
                     wrong = f"joint '{model.joint(joint).name}' of robot '{scene.robot.name}'"
                     raise BackendError(f"{wrong} must be a hinge")
@@ -273,19 +261,12 @@ def _links(model: mujoco.MjModel, scene: Scene, base: int) -> Tables:
     }
 
 
-def _body(model: mujoco.MjModel, scene: Scene, name: str) -> int:
-    """Return the id of a body of the robot."""
-    return _find(model, scene, mujoco.mjtObj.mjOBJ_BODY, name, f"body '{name}' of robot '{scene.robot.name}' is not in")
-
-
-def _geom(model: mujoco.MjModel, scene: Scene, name: str) -> int:
-    """Return the id of a foot's geom."""
-    what = f"foot '{name}' of robot '{scene.robot.name}' is no collision geom of"
-    return _find(model, scene, mujoco.mjtObj.mjOBJ_GEOM, name, what)
-
-
-def _find(model: mujoco.MjModel, scene: Scene, kind: mujoco.mjtObj, name: str, missing: str) -> int:
-    found = mujoco.mj_name2id(model, kind, name)
+def _find(model: mujoco.MjModel, scene: Scene, kind: str, name: str) -> int:
+    """Return the id of a ``body`` or collision ``geom`` of the robot; raise ``BackendError`` where it is missing."""
+    found = mujoco.mj_name2id(model, getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), name)
     if found < 0:
-        raise BackendError(f"{missing} {scene.robot.mjcf.name}; correct robot.toml")
+        missing = (
+            f"robot '{scene.robot.name}' has no {'collision ' * (kind == 'geom')}{kind} '{name}' in its model file"
+        )
+        raise BackendError(f"{missing}; correct robot.toml")
     return int(found)

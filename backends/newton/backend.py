@@ -110,7 +110,12 @@ class NewtonBackend(WarpBackend):
         self._world, self._model = world, world.model
         self._solver = self.adapter(world, scene)
         self._allocate()
-        self._now, self._next = self._model.state(), self._model.state()
+        self._states = self._model.state(), self._model.state()
+        kind: Any = kernels.Motion
+        self._motions = [filled(kind, each, warm_start=self._solver.warm_start) for each in self._states]
+        self._kept = filled(
+            kernels.Motion, **{name: wp.zeros_like(getattr(self._motions[0], name)) for name in kind.vars}
+        )
         self._control = self._model.control()
         self._layout, self._palette = filled(kernels.Layout, world.layout), filled(kernels.Palette, world.slots)
         self._slot_shape = to_warp(world.layout.slot_shape, int)
@@ -123,8 +128,6 @@ class NewtonBackend(WarpBackend):
         self._masses = MassTensors(world, n, self.device)
         self._mask = torch.ones(n + 1, dtype=torch.bool, device=self.device)
         self._ticks = wp.zeros(n, dtype=int, device=on)
-        kept = (*self._coordinates(self._now), self._solver.warm_start)
-        self._kept = tuple(wp.zeros_like(array) for array in kept)
 
     def _warm_up(self) -> None:
         """Compile all kernels before any graph is recorded, and put all worlds at the origin."""
@@ -139,83 +142,74 @@ class NewtonBackend(WarpBackend):
     def _launch(self, kernel: Any, dim: int | tuple[int, ...], *inputs: Any) -> None:
         wp.launch(kernel, dim=dim, inputs=list(inputs), device=self._warp_device)
 
-    def _coordinates(self, state: Any) -> tuple[Any, Any, Any, Any]:
-        return state.joint_q, state.joint_qd, state.body_q, state.body_qd
-
     def _control_period(self, total: int, *, masked: bool, sampled: bool) -> None:
-        """See ``WarpBackend``."""
         n, joints = self.num_worlds, self._joints
         physics, state, motors, active = self.scene.physics, self._live, self._motors.arrays, self._active_array
-        now, after = self._now, self._next
-        changed = (*self._coordinates(now), self._solver.warm_start)
+        states, (now, after) = self._states, self._motions
         width = max(self._world.layout.coordinates, self._world.layout.bodies, self._solver.warm_start.shape[1])
         if masked:
-            self._launch(kernels.copy_inactive, (n, width), self._layout, active, *changed, *self._kept)
-        moving = self._coordinates(now)
-        self._launch(kernels.begin_period, n, self._layout, active, self._request_array, joints, motors, *moving, state)
+            self._launch(kernels.copy_inactive, (n, width), self._layout, active, now, self._kept)
+        self._launch(kernels.begin_period, n, self._layout, active, self._request_array, joints, motors, now, state)
         law = (self._layout, motors, self._dry_friction, self._dry_slope, state.diverged)
         watched, depth = physics.watch_penetration is not None, float(physics.watch_penetration or 0.0)
         tables = (self._layout, active, self._contacts, self._palette, self._terrain_array)
         for substep in range(total):
-            joint_state = (now.joint_q, now.joint_qd, self._control.joint_f)
-            self._launch(kernels.motor_law, (n, joints), substep, *law, *joint_state)
+            self._launch(kernels.motor_law, (n, joints), substep, *law, now, self._control.joint_f)
             last = substep == total - 1
-            self._solver.step(now, after, self._control, observe=last or sampled or watched)
+            self._solver.step(*states, self._control, observe=last or sampled or watched)
             self._solver.collect_overflow(active, state.overflowed)
             if watched:
                 count = self._solver.contacts.rigid_contact_max
                 self._launch(readout.watch_penetration, count, substep, depth, *tables, now.body_q, state)
-            ended = (*self._coordinates(after), self._solver.warm_start, self._ticks, state)
+            ended = (after, self._ticks, state)
             self._launch(kernels.end_substep, n, substep, self._upright_limit, self._layout, active, *ended)
             if sampled:
                 self._read(self._sample_array, substep + 1, after, self._sampled, contacts_of=now)
-            now, after = after, now
+            states, (now, after) = states[::-1], (after, now)
         # the contacts were found in the poses before the last substep
         self._read(active, 1, now, state, contacts_of=after)
-        if now is not self._now:
-            for source, target in zip(self._coordinates(now), self._coordinates(self._now), strict=True):
-                wp.copy(target, source)
+        if now is not self._motions[0]:
+            for name in ("joint_q", "joint_qd", "body_q", "body_qd"):
+                wp.copy(getattr(after, name), getattr(now, name))
         if masked:
-            self._launch(kernels.copy_inactive, (n, width), self._layout, active, *self._kept, *changed)
+            self._launch(kernels.copy_inactive, (n, width), self._layout, active, self._kept, self._motions[0])
 
-    def _read(self, select: Any, value: int, state: Any, out: Any, *, contacts_of: Any) -> None:
+    def _read(self, select: Any, value: int, motion: Any, out: Any, *, contacts_of: Any) -> None:
         """Write the state of the worlds with ``select == value``; forces are zero without ``contacts_of``."""
         n, live = self.num_worlds, self._live
-        self._read_motion(select, value, state, out)
+        self._read_motion(select, value, motion, out)
         self._clear_forces(select, value, out)
         if contacts_of is None:
             return
         self._read_torques(select, value, out)
-        count, poses, chosen = (
-            self._solver.contacts.rigid_contact_max,
-            contacts_of.body_q,
-            (select, value, self._layout),
-        )
+        count, poses = self._solver.contacts.rigid_contact_max, contacts_of.body_q
+        chosen = (select, value, self._layout)
         self._launch(readout.add_contacts, count, *chosen, self._contacts, poses, live.diverged, out)
         self._launch(readout.finish_contacts, n, *chosen, poses, out)
 
-    def _read_motion(self, select: Any, value: int, state: Any, out: Any) -> None:
+    def _read_motion(self, select: Any, value: int, motion: Any, out: Any) -> None:
         """Write poses, velocities and flags."""
         n, com, timestep = self.num_worlds, self._model.body_com, self.scene.physics.timestep
-        moving = (self._layout, self._ticks, state.joint_q, state.joint_qd, com, self._live, out)
+        moving = (self._layout, self._ticks, motion, com, self._live, out)
         self._launch(readout.read_base_and_joints, (n, self._joints), select, value, timestep, *moving)
-        bodies = (self._layout, state.body_q, state.body_qd, com, out)
-        self._launch(readout.read_feet, (n, self._feet), select, value, *bodies)
+        self._launch(readout.read_feet, (n, self._feet), select, value, self._layout, motion, com, out)
+
+    def _complete_kinematics(self) -> None:
+        """Compute the bodies' poses and twists from the joints'."""
+        state = self._states[0]
+        newton.eval_fk(self._model, state.joint_q, state.joint_qd, state)
 
     def _place_robots(self) -> None:
-        """See ``WarpBackend``."""
         self._mask[:-1].copy_(self._active)
         asked = (self._layout, self._active_array, self._request_array, *self._reset_arrays)
-        forces = (self._now.body_f, self._next.body_f)
-        written = (self._motors.arrays, self._now.joint_q, self._now.joint_qd, *forces, self._ticks, self._live)
+        written = (self._motors.arrays, *self._motions, self._ticks, self._live)
         dim = (self.num_worlds, self._joints)
         self._launch(kernels.reset_worlds, dim, *asked, self._model.body_com, *written)
-        self._solver.reset(self._now, wp.from_torch(self._mask))
-        newton.eval_fk(self._model, self._now.joint_q, self._now.joint_qd, self._now)
-        self._read(self._active_array, 1, self._now, self._live, contacts_of=None)
+        self._solver.reset(self._states[0], wp.from_torch(self._mask))
+        self._complete_kinematics()
+        self._read(self._active_array, 1, self._motions[0], self._live, contacts_of=None)
 
     def _place_terrain(self) -> None:
-        """See ``WarpBackend``."""
         asked = (self._layout, self._active_array, self._new_terrain_array, len(self.scene.terrains))
         tables = (self._slot_shape, self._palette, self._terrain_array)
         shapes = (self._model.shape_transform, self._model.shape_scale)
@@ -224,12 +218,10 @@ class NewtonBackend(WarpBackend):
         self._solver.shapes_changed(self._terrain_array)
 
     def _push_base(self) -> None:
-        """See ``WarpBackend``."""
-        push = (self._layout, self._active_array, self._twist_array)
-        moved = (self._model.body_com, self._now.joint_q, self._now.joint_qd)
-        self._launch(kernels.push_base, self.num_worlds, *push, *moved)
-        newton.eval_fk(self._model, self._now.joint_q, self._now.joint_qd, self._now)
-        self._read_motion(self._active_array, 1, self._now, self._live)
+        push = (self._layout, self._active_array, self._twist_array, self._model.body_com, self._motions[0])
+        self._launch(kernels.push_base, self.num_worlds, *push)
+        self._complete_kinematics()
+        self._read_motion(self._active_array, 1, self._motions[0], self._live)
 
     # ---- the contract -------------------------------------------------------------------------------------------
 
@@ -254,9 +246,9 @@ class NewtonBackend(WarpBackend):
                 self._solver.shapes_changed(self._terrain_array)
             if "base_com_offset" in rows:
                 shift = (self._layout, masses.nominal_com, wp.from_torch(masses.com_offset))
-                moved = (self._model.body_com, self._now.joint_q, self._now.joint_qd)
+                moved = (self._model.body_com, self._motions[0])
                 self._launch(kernels.move_center_of_mass, self.num_worlds, *shift, *moved)
-                newton.eval_fk(self._model, self._now.joint_q, self._now.joint_qd, self._now)
+                self._complete_kinematics()
             if {"base_mass_offset", "link_mass_scale", "base_com_offset"} & set(rows):
                 masses.write(self._solver)
 
@@ -265,7 +257,7 @@ class NewtonBackend(WarpBackend):
         check_force(self.scene, force_w)
         n, layout = self.num_worlds, self._world.layout
         with self._scope():
-            for state in (self._now, self._next):
+            for state in self._states:
                 wrenches = wp.to_torch(state.body_f).view(n, layout.bodies, 6)
                 wrenches[:, layout.base, :3] = force_w.to(self.device, torch.float32)
 

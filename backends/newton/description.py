@@ -22,9 +22,7 @@ def describe_newton(scene: Scene, world: WorldModel, motors: MotorTensors, dry: 
     limits = [first(f"joint_limit_{end}", layout.dofs)[dofs] for end in ("lower", "upper")]
     friction = first("shape_material_mu", layout.shapes)
     feet = [int(np.flatnonzero(layout.shape_foot == f)[0]) for f in range(len(scene.robot.foot_names))]
-    # the floor is the first shape of the ground
-    floor = int(np.flatnonzero(layout.shape_ground)[0])
-    strength = motors.strength[0].cpu().numpy()
+    floor = int(np.flatnonzero(layout.shape_ground)[0])  # the first shape of the ground
     return ModelFields(
         total_mass=float(mass.sum()),
         body_mass=mass[bodies],
@@ -33,9 +31,7 @@ def describe_newton(scene: Scene, world: WorldModel, motors: MotorTensors, dry: 
         joint_armature=first("joint_armature", layout.dofs)[dofs],
         joint_damping=first("joint_damping", layout.dofs)[dofs],
         joint_friction_loss=np.maximum(dry, first("joint_friction", layout.dofs)[dofs]),
-        stiffness=motors.stiffness[0].cpu().numpy() * strength,
-        damping=motors.damping[0].cpu().numpy() * strength,
-        torque_limit=motors.torque_limit.cpu().numpy() * strength,
+        **motors.described(),
         foot_friction=friction[feet],
         floor_friction=float(friction[floor]),
     ).describe()

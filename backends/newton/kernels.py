@@ -48,6 +48,19 @@ class Layout:
 
 
 @wp.struct
+class Motion:
+    """One of Newton's states, with what the solver carries from step to step."""
+
+    joint_q: wp.array[float]
+    joint_qd: wp.array[float]
+    body_q: wp.array[wp.transform]
+    body_qd: wp.array[wp.spatial_vector]
+    body_f: wp.array[wp.spatial_vector]
+    """External force and torque on each body."""
+    warm_start: wp.array2d[float]
+
+
+@wp.struct
 class Palette:
     """Shapes of the palette's terrains, by terrain and slot: the boxes and, where there is one, the height field."""
 
@@ -76,51 +89,43 @@ class ContactArrays:
 @wp.func
 def root_rotation(joint_q: wp.array[float], start: int) -> wp.quat:
     """Return the orientation of the base."""
-    q = wp.quat(joint_q[start + 3], joint_q[start + 4], joint_q[start + 5], joint_q[start + 6])
-    return wp.normalize(q)
+    return wp.normalize(wp.quat(joint_q[start + 3], joint_q[start + 4], joint_q[start + 5], joint_q[start + 6]))
 
 
 @wp.func
-def root_origin_velocity(
-    layout: Layout, world: int, joint_q: wp.array[float], joint_qd: wp.array[float], com: wp.array[wp.vec3]
-) -> wp.vec3:
+def root_origin_velocity(layout: Layout, world: int, motion: Motion, com: wp.array[wp.vec3]) -> wp.vec3:
     """Return the velocity of the base's origin, world frame, from that of its centre of mass."""
     v = world * layout.dofs
-    spin = wp.vec3(joint_qd[v + 3], joint_qd[v + 4], joint_qd[v + 5])
-    arm = wp.quat_rotate(root_rotation(joint_q, world * layout.coordinates), com[world * layout.bodies + layout.base])
-    return wp.vec3(joint_qd[v], joint_qd[v + 1], joint_qd[v + 2]) - wp.cross(spin, arm)
+    spin = wp.vec3(motion.joint_qd[v + 3], motion.joint_qd[v + 4], motion.joint_qd[v + 5])
+    rotation = root_rotation(motion.joint_q, world * layout.coordinates)
+    arm = wp.quat_rotate(rotation, com[world * layout.bodies + layout.base])
+    return wp.vec3(motion.joint_qd[v], motion.joint_qd[v + 1], motion.joint_qd[v + 2]) - wp.cross(spin, arm)
 
 
 @wp.func
-def park(
-    layout: Layout,
-    world: int,
-    joint_q: wp.array[float],
-    joint_qd: wp.array[float],
-    body_q: wp.array[wp.transform],
-    body_qd: wp.array[wp.spatial_vector],
-):
+def park(layout: Layout, world: int, motion: Motion):
     """Put a diverged world at rest, high above the ground."""
     for i in range(layout.coordinates):
-        joint_q[world * layout.coordinates + i] = 0.0
-    joint_q[world * layout.coordinates + 2] = PARKED_HEIGHT
-    joint_q[world * layout.coordinates + 6] = 1.0
+        motion.joint_q[world * layout.coordinates + i] = 0.0
+    motion.joint_q[world * layout.coordinates + 2] = PARKED_HEIGHT
+    motion.joint_q[world * layout.coordinates + 6] = 1.0
     for i in range(layout.dofs):
-        joint_qd[world * layout.dofs + i] = 0.0
+        motion.joint_qd[world * layout.dofs + i] = 0.0
     for i in range(layout.bodies):
-        body_q[world * layout.bodies + i] = wp.transform(wp.vec3(0.0, 0.0, PARKED_HEIGHT), wp.quat_identity())
-        body_qd[world * layout.bodies + i] = wp.spatial_vector(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        body = world * layout.bodies + i
+        motion.body_q[body] = wp.transform(wp.vec3(0.0, 0.0, PARKED_HEIGHT), wp.quat_identity())
+        motion.body_qd[body] = wp.spatial_vector(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 @wp.func
-def state_is_valid(layout: Layout, world: int, joint_q: wp.array[float], joint_qd: wp.array[float]) -> bool:
+def state_is_valid(layout: Layout, world: int, motion: Motion) -> bool:
     """Return whether all coordinates and velocities of a world are finite and within the limits."""
     valid = bool(True)
     for i in range(layout.coordinates):
-        if not (wp.abs(joint_q[world * layout.coordinates + i]) < POSITION_LIMIT):  # false for NaN, too
+        if not (wp.abs(motion.joint_q[world * layout.coordinates + i]) < POSITION_LIMIT):  # false for NaN, too
             valid = False
     for i in range(layout.dofs):
-        if not (wp.abs(joint_qd[world * layout.dofs + i]) < VELOCITY_LIMIT):
+        if not (wp.abs(motion.joint_qd[world * layout.dofs + i]) < VELOCITY_LIMIT):
             valid = False
     return valid
 
@@ -132,17 +137,14 @@ def begin_period(
     has_request: wp.array[int],
     joints: int,
     motors: Motors,
-    joint_q: wp.array[float],
-    joint_qd: wp.array[float],
-    body_q: wp.array[wp.transform],
-    body_qd: wp.array[wp.spatial_vector],
+    motion: Motion,
     state: StateArrays,
 ):
     """Shift the targets and clear the watches of the worlds that will step; park invalid ones."""
     world = wp.tid()
     if active[world] == 0:
         return
-    valid = state_is_valid(layout, world, joint_q, joint_qd)
+    valid = state_is_valid(layout, world, motion)
     for joint in range(joints):
         take_target(motors, world, joint, has_request[0])
         if has_request[0] != 0 and not (wp.abs(motors.requested[world, joint]) < POSITION_LIMIT):
@@ -151,24 +153,11 @@ def begin_period(
     if not valid:
         state.diverged[world] = True
     if state.diverged[world]:
-        park(layout, world, joint_q, joint_qd, body_q, body_qd)
+        park(layout, world, motion)
 
 
 @wp.kernel
-def copy_inactive(
-    layout: Layout,
-    active: wp.array[int],
-    joint_q: wp.array[float],
-    joint_qd: wp.array[float],
-    body_q: wp.array[wp.transform],
-    body_qd: wp.array[wp.spatial_vector],
-    warm_start: wp.array2d[float],
-    to_joint_q: wp.array[float],
-    to_joint_qd: wp.array[float],
-    to_body_q: wp.array[wp.transform],
-    to_body_qd: wp.array[wp.spatial_vector],
-    to_warm_start: wp.array2d[float],
-):
+def copy_inactive(layout: Layout, active: wp.array[int], source: Motion, target: Motion):
     """Copy the state of the worlds that must not step, away before a step and back after it."""
     world, i = wp.tid()
     if active[world] != 0:
@@ -177,14 +166,14 @@ def copy_inactive(
     v = world * layout.dofs + i
     b = world * layout.bodies + i
     if i < layout.coordinates:
-        to_joint_q[q] = joint_q[q]
+        target.joint_q[q] = source.joint_q[q]
     if i < layout.dofs:
-        to_joint_qd[v] = joint_qd[v]
+        target.joint_qd[v] = source.joint_qd[v]
     if i < layout.bodies:
-        to_body_q[b] = body_q[b]
-        to_body_qd[b] = body_qd[b]
-    if i < warm_start.shape[1]:
-        to_warm_start[world, i] = warm_start[world, i]
+        target.body_q[b] = source.body_q[b]
+        target.body_qd[b] = source.body_qd[b]
+    if i < source.warm_start.shape[1]:
+        target.warm_start[world, i] = source.warm_start[world, i]
 
 
 @wp.kernel
@@ -195,15 +184,14 @@ def motor_law(
     dry_friction: wp.array[float],
     dry_slope: wp.array[float],
     diverged: wp.array[wp.bool],
-    joint_q: wp.array[float],
-    joint_qd: wp.array[float],
+    motion: Motion,
     joint_f: wp.array[float],
 ):
     """Apply the motor law and, for solvers without it, dry friction [N·m] with its slope around zero speed [N·m·s/rad]."""
     world, joint = wp.tid()
     dof = world * layout.dofs + layout.joint_v[joint]
-    position = joint_q[world * layout.coordinates + layout.joint_q[joint]]
-    velocity = joint_qd[dof]
+    position = motion.joint_q[world * layout.coordinates + layout.joint_q[joint]]
+    velocity = motion.joint_qd[dof]
     torque = motor_torque(motors, world, joint, substep, position, velocity)
     if diverged[world]:
         torque = 0.0
@@ -218,11 +206,7 @@ def end_substep(
     upright_limit: float,
     layout: Layout,
     active: wp.array[int],
-    joint_q: wp.array[float],
-    joint_qd: wp.array[float],
-    body_q: wp.array[wp.transform],
-    body_qd: wp.array[wp.spatial_vector],
-    warm_start: wp.array2d[float],
+    motion: Motion,
     ticks: wp.array[int],
     state: StateArrays,
 ):
@@ -231,15 +215,16 @@ def end_substep(
     if active[world] == 0:
         return
     ticks[world] = ticks[world] + 1
-    if not state_is_valid(layout, world, joint_q, joint_qd):
+    if not state_is_valid(layout, world, motion):
         state.diverged[world] = True
     if state.diverged[world]:
-        park(layout, world, joint_q, joint_qd, body_q, body_qd)
-        for i in range(warm_start.shape[1]):
-            warm_start[world, i] = 0.0
+        park(layout, world, motion)
+        for i in range(motion.warm_start.shape[1]):
+            motion.warm_start[world, i] = 0.0
         return
     q = world * layout.coordinates
-    upright = 1.0 - 2.0 * (joint_q[q + 3] * joint_q[q + 3] + joint_q[q + 4] * joint_q[q + 4])
+    x, y = motion.joint_q[q + 3], motion.joint_q[q + 4]
+    upright = 1.0 - 2.0 * (x * x + y * y)
     if upright < upright_limit and state.tilt_substep[world] == wp.int64(0):
         state.tilt_substep[world] = wp.int64(substep + 1)
 
@@ -271,19 +256,17 @@ def reset_worlds(
     joint_velocity: wp.array2d[float],
     body_com: wp.array[wp.vec3],
     motors: Motors,
-    joint_q: wp.array[float],
-    joint_qd: wp.array[float],
-    external: wp.array[wp.spatial_vector],
-    external_other: wp.array[wp.spatial_vector],
+    motion: Motion,
+    other: Motion,
     ticks: wp.array[int],
     state: StateArrays,
 ):
-    """Put the masked worlds into the given state. ``requested`` holds the held targets."""
+    """Put the masked worlds into the given state, without external forces in ``other``, too; ``requested`` holds the held targets."""
     world, joint = wp.tid()
     if active[world] == 0:
         return
-    joint_q[world * layout.coordinates + layout.joint_q[joint]] = joint_position[world, joint]
-    joint_qd[world * layout.dofs + layout.joint_v[joint]] = joint_velocity[world, joint]
+    motion.joint_q[world * layout.coordinates + layout.joint_q[joint]] = joint_position[world, joint]
+    motion.joint_qd[world * layout.dofs + layout.joint_v[joint]] = joint_velocity[world, joint]
     hold_target(motors, world, joint, has_held[0])
     if joint == 0:
         q = world * layout.coordinates
@@ -293,14 +276,14 @@ def reset_worlds(
         arm = wp.quat_rotate(rotation, body_com[world * layout.bodies + layout.base])
         velocity = wp.vec3(twist[world, 0], twist[world, 1], twist[world, 2]) + wp.cross(spin, arm)
         for i in range(3):
-            joint_q[q + i] = pose[world, i]
-            joint_qd[v + i] = velocity[i]
-            joint_qd[v + 3 + i] = spin[i]
+            motion.joint_q[q + i] = pose[world, i]
+            motion.joint_qd[v + i] = velocity[i]
+            motion.joint_qd[v + 3 + i] = spin[i]
         for i in range(4):
-            joint_q[q + 3 + i] = rotation[i]
+            motion.joint_q[q + 3 + i] = rotation[i]
         for i in range(layout.bodies):
-            external[world * layout.bodies + i] = wp.spatial_vector(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-            external_other[world * layout.bodies + i] = wp.spatial_vector(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+            motion.body_f[world * layout.bodies + i] = wp.spatial_vector(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+            other.body_f[world * layout.bodies + i] = wp.spatial_vector(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
         ticks[world] = 0
         reset_world(motors, world, has_held[0], state)
 
@@ -333,21 +316,17 @@ def place_terrain(
 
 @wp.kernel
 def push_base(
-    layout: Layout,
-    active: wp.array[int],
-    twist: wp.array2d[float],
-    body_com: wp.array[wp.vec3],
-    joint_q: wp.array[float],
-    joint_qd: wp.array[float],
+    layout: Layout, active: wp.array[int], twist: wp.array2d[float], body_com: wp.array[wp.vec3], motion: Motion
 ):
     """Set the base's velocities; NaN keeps the present value."""
     world = wp.tid()
     if active[world] == 0:
         return
     v = world * layout.dofs
-    rotation = root_rotation(joint_q, world * layout.coordinates)
-    velocity = root_origin_velocity(layout, world, joint_q, joint_qd, body_com)
-    spin = wp.quat_rotate_inv(rotation, wp.vec3(joint_qd[v + 3], joint_qd[v + 4], joint_qd[v + 5]))
+    rotation = root_rotation(motion.joint_q, world * layout.coordinates)
+    velocity = root_origin_velocity(layout, world, motion, body_com)
+    turning = wp.vec3(motion.joint_qd[v + 3], motion.joint_qd[v + 4], motion.joint_qd[v + 5])
+    spin = wp.quat_rotate_inv(rotation, turning)
     for i in range(3):
         if not wp.isnan(twist[world, i]):
             velocity[i] = twist[world, i]
@@ -356,26 +335,22 @@ def push_base(
     spin = wp.quat_rotate(rotation, spin)
     velocity = velocity + wp.cross(spin, wp.quat_rotate(rotation, body_com[world * layout.bodies + layout.base]))
     for i in range(3):
-        joint_qd[v + i] = velocity[i]
-        joint_qd[v + 3 + i] = spin[i]
+        motion.joint_qd[v + i] = velocity[i]
+        motion.joint_qd[v + 3 + i] = spin[i]
 
 
 @wp.kernel
 def move_center_of_mass(
-    layout: Layout,
-    nominal: wp.vec3,
-    offset: wp.array2d[float],
-    body_com: wp.array[wp.vec3],
-    joint_q: wp.array[float],
-    joint_qd: wp.array[float],
+    layout: Layout, nominal: wp.vec3, offset: wp.array2d[float], body_com: wp.array[wp.vec3], motion: Motion
 ):
     """Shift the base's centre of mass, and adapt its velocity so that the base's motion stays."""
     world = wp.tid()
-    velocity = root_origin_velocity(layout, world, joint_q, joint_qd, body_com)
+    velocity = root_origin_velocity(layout, world, motion, body_com)
     center = nominal + wp.vec3(offset[world, 0], offset[world, 1], offset[world, 2])
     body_com[world * layout.bodies + layout.base] = center
     v = world * layout.dofs
-    spin = wp.vec3(joint_qd[v + 3], joint_qd[v + 4], joint_qd[v + 5])
-    velocity = velocity + wp.cross(spin, wp.quat_rotate(root_rotation(joint_q, world * layout.coordinates), center))
+    spin = wp.vec3(motion.joint_qd[v + 3], motion.joint_qd[v + 4], motion.joint_qd[v + 5])
+    rotation = root_rotation(motion.joint_q, world * layout.coordinates)
+    velocity = velocity + wp.cross(spin, wp.quat_rotate(rotation, center))
     for i in range(3):
-        joint_qd[v + i] = velocity[i]
+        motion.joint_qd[v + i] = velocity[i]

@@ -183,15 +183,12 @@ def _repair_import(
         world.body_com[i] = wp.vec3(*reference.body_ipos[i + 1])
         world.body_inertia[i] = wp.mat33(*inertia.ravel())
         world.body_inv_inertia[i] = wp.mat33(*np.linalg.inv(inertia).ravel())
-    for i, label in enumerate(world.joint_label):
-        if i == 0:
-            continue
+    for i, label in enumerate(world.joint_label[1:], 1):
         joint = reference.joint(_leaf(label))
         dof, start = int(joint.dofadr[0]), world.joint_qd_start[i]
         world.joint_armature[start] = float(reference.dof_armature[dof])
         world.joint_friction[start] = float(reference.dof_frictionloss[dof])
-        damping = reference.dof_damping[dof]
-        world.joint_damping[start] = float(damping[0] if damping.ndim else damping)
+        world.joint_damping[start] = float(reference.dof_damping[dof].flat[0])
         if joint.limited[0]:
             world.joint_limit_lower[start], world.joint_limit_upper[start] = map(float, joint.range)
         # kernels compute the motors' torques: no drive of Newton's, no effort limit
@@ -202,16 +199,10 @@ def _repair_import(
         geom = reference.geom(_leaf(label))
         world.shape_gap[i] = gap
         world.shape_margin[i] = float(geom.margin[0]) if skin else 0.0
-        world.shape_transform[i] = wp.transform(geom.pos, _xyzw(geom.quat))
+        world.shape_transform[i] = wp.transform(geom.pos, wp.quat(*np.roll(geom.quat, -1)))  # wxyz becomes xyzw
     world.joint_q[2] = BIRTH_HEIGHT
     for name, angle in zip(robot.joint_names, robot.default_joint_position, strict=True):
         world.joint_q[world.joint_q_start[_joint(world, name, robot.name)]] = float(angle)
-
-
-def _xyzw(quaternion: NDArray) -> wp.quat:
-    """Return Warp's quaternion of a MuJoCo one."""
-    w, x, y, z = (float(v) for v in quaternion)
-    return wp.quat(x, y, z, w)
 
 
 def _joint(world: newton.ModelBuilder, name: str, robot: str) -> int:
@@ -342,17 +333,14 @@ def _layout(
     joints = [_joint(world, name, robot.name) for name in robot.joint_names]
     count = len(world.shape_type)
     body_index = {bodies[name]: i for i, name in enumerate(robot.collision_bodies)}
-    foot, body = np.full(count, -1, dtype=np.int32), np.full(count, -1, dtype=np.int32)
-    trunk, ground = np.zeros(count, dtype=np.int32), np.zeros(count, dtype=np.int32)
-    slot = np.full(count, -1, dtype=np.int32)
-    for i, name in enumerate(robot.foot_geoms):
-        foot[shapes[name]] = i
+    foot, body, slot = np.full((3, count), -1, dtype=np.int32)
+    trunk, ground = np.zeros((2, count), dtype=np.int32)
+    feet = [shapes[name] for name in robot.foot_geoms]
+    foot[feet] = np.arange(len(feet))
     trunk[[shapes[name] for name in robot.trunk_shapes]] = 1
-    for shape in range(robot_shapes):
-        body[shape] = body_index.get(world.shape_body[shape], -1)
+    body[:robot_shapes] = [body_index.get(index, -1) for index in world.shape_body[:robot_shapes]]
     ground[robot_shapes:] = 1
     slot[slot_shapes] = np.arange(len(slot_shapes))
-    feet = [shapes[name] for name in robot.foot_geoms]
     return WorldLayout(
         coordinates=len(world.joint_q),
         dofs=len(world.joint_qd),

@@ -6,7 +6,7 @@
 import warp as wp
 
 from ..warp.state import StateArrays
-from .kernels import ContactArrays, Layout, Palette, root_origin_velocity, root_rotation
+from .kernels import ContactArrays, Layout, Motion, Palette, root_origin_velocity, root_rotation
 
 wp.set_module_options({"enable_backward": False})
 
@@ -45,10 +45,9 @@ def watch_penetration(
     world = first / layout.shapes
     if active[world] == 0 or state.diverged[world] or palette.wall[terrain[world], slot] != 0:
         return
-    apart = world_point(contacts, second, contacts.point1[c], body_q) - world_point(
-        contacts, first, contacts.point0[c], body_q
-    )
-    distance = wp.dot(apart, contacts.normal[c]) - contacts.margin0[c] - contacts.margin1[c]
+    one = world_point(contacts, first, contacts.point0[c], body_q)
+    two = world_point(contacts, second, contacts.point1[c], body_q)
+    distance = wp.dot(two - one, contacts.normal[c]) - contacts.margin0[c] - contacts.margin1[c]
     # several contacts of one world write the same number
     if distance < -depth and state.penetration_substep[world] == wp.int64(0):
         state.penetration_substep[world] = wp.int64(substep + 1)
@@ -61,8 +60,7 @@ def read_base_and_joints(
     timestep: float,
     layout: Layout,
     ticks: wp.array[int],
-    joint_q: wp.array[float],
-    joint_qd: wp.array[float],
+    motion: Motion,
     body_com: wp.array[wp.vec3],
     live: StateArrays,
     out: StateArrays,
@@ -71,19 +69,18 @@ def read_base_and_joints(
     world, joint = wp.tid()
     if select[world] != value:
         return
-    out.joint_position[world, joint] = joint_q[world * layout.coordinates + layout.joint_q[joint]]
-    out.joint_velocity[world, joint] = joint_qd[world * layout.dofs + layout.joint_v[joint]]
+    out.joint_position[world, joint] = motion.joint_q[world * layout.coordinates + layout.joint_q[joint]]
+    out.joint_velocity[world, joint] = motion.joint_qd[world * layout.dofs + layout.joint_v[joint]]
     if joint == 0:
         q = world * layout.coordinates
         v = world * layout.dofs
-        rotation = root_rotation(joint_q, q)
+        rotation = root_rotation(motion.joint_q, q)
+        spin = wp.vec3(motion.joint_qd[v + 3], motion.joint_qd[v + 4], motion.joint_qd[v + 5])
         out.time[world] = float(ticks[world]) * timestep
-        out.base_position_w[world] = wp.vec3(joint_q[q], joint_q[q + 1], joint_q[q + 2])
+        out.base_position_w[world] = wp.vec3(motion.joint_q[q], motion.joint_q[q + 1], motion.joint_q[q + 2])
         out.base_quaternion_w[world] = wp.vec4(rotation[3], rotation[0], rotation[1], rotation[2])
-        out.base_linear_velocity_w[world] = root_origin_velocity(layout, world, joint_q, joint_qd, body_com)
-        out.base_angular_velocity_b[world] = wp.quat_rotate_inv(
-            rotation, wp.vec3(joint_qd[v + 3], joint_qd[v + 4], joint_qd[v + 5])
-        )
+        out.base_linear_velocity_w[world] = root_origin_velocity(layout, world, motion, body_com)
+        out.base_angular_velocity_b[world] = wp.quat_rotate_inv(rotation, spin)
         out.tilt_substep[world] = live.tilt_substep[world]
         out.penetration_substep[world] = live.penetration_substep[world]
         out.diverged[world] = live.diverged[world]
@@ -92,22 +89,16 @@ def read_base_and_joints(
 
 @wp.kernel
 def read_feet(
-    select: wp.array[int],
-    value: int,
-    layout: Layout,
-    body_q: wp.array[wp.transform],
-    body_qd: wp.array[wp.spatial_vector],
-    body_com: wp.array[wp.vec3],
-    out: StateArrays,
+    select: wp.array[int], value: int, layout: Layout, motion: Motion, body_com: wp.array[wp.vec3], out: StateArrays
 ):
     """Read positions and velocities of the feet."""
     world, foot = wp.tid()
     if select[world] != value:
         return
     body = world * layout.bodies + layout.foot_body[foot]
-    position = wp.transform_point(body_q[body], layout.foot_center[foot])
-    arm = position - wp.transform_point(body_q[body], body_com[body])
-    twist = body_qd[body]
+    position = wp.transform_point(motion.body_q[body], layout.foot_center[foot])
+    arm = position - wp.transform_point(motion.body_q[body], body_com[body])
+    twist = motion.body_qd[body]
     out.foot_position_w[world, foot] = position
     out.foot_velocity_w[world, foot] = wp.spatial_top(twist) + wp.cross(wp.spatial_bottom(twist), arm)
 

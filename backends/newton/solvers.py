@@ -135,8 +135,7 @@ class MujocoAdapter(SolverAdapter):
     @classmethod
     def solver_settings(cls, physics: PhysicsOptions) -> Mapping[str, float | str]:
         """See ``SolverAdapter.solver_settings``: no tolerance below what single precision can reach."""
-        names = ("cone", "impratio", "iterations", "ls_iterations")
-        asked = {name: getattr(physics, name) for name in names}
+        asked = {name: getattr(physics, name) for name in ("cone", "impratio", "iterations", "ls_iterations")}
         return {**asked, "tolerance": max(physics.tolerance, SMALLEST_TOLERANCE)}
 
     def __init__(self, world: WorldModel, scene: Scene) -> None:
@@ -175,12 +174,9 @@ class MujocoAdapter(SolverAdapter):
         self._model.opt.warn_overflow = 0  # alarms are reported per world, not printed by the device
         self._check_import(world, scene)
         geoms = _geom_shapes(self.solver)
-        margin = np.zeros(geoms.shape, dtype=np.float32)
-        local = geoms[0] % world.layout.shapes
-        for geom, shape in enumerate(local):
-            if world.layout.shape_ground[shape] == 0:
-                margin[:, geom] = model.shape_margin.numpy()[shape]
-        self._margin: wp.array = wp.array(margin, dtype=float, device=model.device)
+        shapes = geoms[0] % world.layout.shapes
+        margin = np.where(world.layout.shape_ground[shapes] == 0, model.shape_margin.numpy()[shapes], 0.0)
+        self._margin: wp.array = wp.array(np.tile(margin, (len(geoms), 1)), dtype=float, device=model.device)
         self.fields = _FieldGeom(self.solver, world, scene) if world.slots.fields else None
         self.warm_start = self._data.qacc_warmstart
         self.contacts = newton.Contacts(self.solver.get_max_contact_count(), 0, device=model.device)

@@ -3,6 +3,7 @@
 """Targets, latency and law of the motors of all worlds: ``gaitgauge.backends.motor_law`` for kernels."""
 
 # Warp reads the annotations of structs and functions: no ``from __future__ import annotations`` here.
+import numpy as np
 import torch
 import warp as wp
 
@@ -70,6 +71,11 @@ class MotorTensors:
         for name in ("current", "previous", "torque"):
             setattr(arrays, name, wp.zeros(shape, dtype=float, device=on))
         arrays.limp, arrays.limp_before = (wp.ones(shape[0], dtype=int, device=on) for _ in range(2))
+
+    def described(self) -> dict[str, np.ndarray]:
+        """Return the constants of the first world's motors by their names in ``PhysicsBackend.describe``, (J,) each."""
+        values = {"stiffness": self.stiffness[0], "damping": self.damping[0], "torque_limit": self.torque_limit}
+        return {name: (value * self.strength[0]).cpu().numpy() for name, value in values.items()}
 
 
 @wp.func
