@@ -25,8 +25,7 @@ def check_start(scene: Scene, start: ResetState, worlds: torch.Tensor | None) ->
     columns: dict[str, tuple[int, ...]] = {"base_quaternion": (4,), "terrain_index": ()}
     for item in fields(ResetState):
         joints = (scene.robot.num_joints,) if item.name.startswith(("joint_", "held_")) else (3,)
-        shape = (scene.num_worlds, *columns.get(item.name, joints))
-        _check_shape(item.name, getattr(start, item.name), shape)
+        _check_shape(item.name, getattr(start, item.name), (scene.num_worlds, *columns.get(item.name, joints)))
     index = start.terrain_index
     if index is None or any(each is not None and each.device.type != "cpu" for each in (index, worlds)):
         return

@@ -45,6 +45,5 @@ class ModelFields:
         found["body_inertia"] = np.linalg.eigvalsh(inertia) if inertia.ndim == 3 else np.sort(inertia, axis=1)
         found["torque_limit"] = np.where(limit >= UNLIMITED, np.inf, limit)
         first = found["foot_priority"]
-        larger = np.maximum(foot, floor)
-        found["contact_friction"] = np.where(first > 0, foot, np.where(first < 0, floor, larger))
+        found["contact_friction"] = np.where(first > 0, foot, np.where(first < 0, floor, np.maximum(foot, floor)))
         return {name: [float(v) for v in found[name].ravel()] for name in DESCRIPTION_KEYS}

@@ -56,8 +56,7 @@ def stand_still(
 def pressure_point(state: SimpleNamespace) -> np.ndarray:
     """Return the point of attack of the ground force at the height of the contact centre, (N, 2) [m], from force and moment."""
     force, moment, center = state.ground_force_w, state.ground_moment_w, state.contact_center_w
-    shift = np.stack([-moment[:, 1], moment[:, 0]], axis=1) / force[:, 2:3]
-    return center[:, :2] + shift
+    return center[:, :2] + np.stack([-moment[:, 1], moment[:, 0]], axis=1) / force[:, 2:3]
 
 
 def centers_of_mass(
@@ -117,8 +116,7 @@ def moment(bench: Bench) -> str:
         radius = Reference(bench.robot, bench.stiff()).foot_radius
         points = state.foot_position_w - [0.0, 0.0, radius]
         expect_close("contact_center_w [m]", state.contact_center_w, points.mean(1), 0.005)
-        arms = points - state.contact_center_w[:, None, :]
-        expected = np.cross(arms, state.foot_contact_force_w).sum(1)
+        expected = np.cross(points - state.contact_center_w[:, None, :], state.foot_contact_force_w).sum(1)
         # rolling and torsional friction of six-dimensional contacts add moments of their own
         expect_close("ground_moment_w against the feet's forces [N·m]", state.ground_moment_w, expected, 1.0)
         found, below = pressure_point(state), centers_of_mass(bench, worlds, state)[:, :2]
@@ -241,11 +239,8 @@ def hold_to_converged(bench: Bench, physics: PhysicsOptions) -> str:
 def torsion(bench: Bench) -> str:
     """Spinning on one foot below its centre of mass, a robot slows down as the reference does, by torsional friction (dimension 4)."""
     parameters, seconds = bench.stiff(), 0.1
-    rates = 3.0 * (-1.0) ** np.arange(WORLDS)
-    starts = [
-        spun(Reference(bench.robot, parameters), foot=row % len(bench.robot.foot_names), rate=rate)
-        for row, rate in enumerate(rates)
-    ]
+    reference, feet = Reference(bench.robot, parameters), len(bench.robot.foot_names)
+    starts = [spun(reference, foot=row % feet, rate=3.0 * (-1.0) ** row) for row in range(WORLDS)]
     reset = {name: [start[name] for start in starts] for name in starts[0]}
     found, expected = {}, {}
     for condim in (3, 4):

@@ -22,13 +22,11 @@ FORCE_FIELDS = (
 def posed(bench: Bench, count: int, *, seed: int = 1) -> dict[str, Any]:
     """Return a reset to a different place, turn about all axes, pose and motion in every world."""
     random = np.random.default_rng(seed)
-    reference = Reference(bench.robot, bench.soft())
-    low, high = reference.joint_range.T
+    low, high = Reference(bench.robot, bench.soft()).joint_range.T
     pose = np.asarray(bench.robot.default_joint_position)
     joints = np.clip(pose + random.uniform(-0.3, 0.3, (count, len(pose))), low + 0.02, high - 0.02)
-    around = np.array([0.0, 0.0, 2.0])
     return {
-        "base_position": around + random.uniform(-0.5, 0.5, (count, 3)),
+        "base_position": np.array([0.0, 0.0, 2.0]) + random.uniform(-0.5, 0.5, (count, 3)),
         "base_quaternion": np.array([axis_angle(random.normal(size=3), a) for a in random.uniform(0.5, 2.5, count)]),
         "joint_position": joints,
         "base_linear_velocity": random.uniform(-1.0, 1.0, (count, 3)),
@@ -189,8 +187,7 @@ def tumble(bench: Bench) -> str:
         asked = posed(bench, worlds.count, seed=4)
         worlds.reset(**asked)
         worlds.run(0.1)
-        state = worlds.read()
-        error = follow_reference(bench, worlds, asked, state, seconds=0.1, angle=0.01, position=0.003)
+        error = follow_reference(bench, worlds, asked, worlds.read(), seconds=0.1, angle=0.01, position=0.003)
     return f"after 0.1 s: {error}"
 
 

@@ -76,8 +76,7 @@ def single_substeps(bench: Bench) -> str:
             worlds.step(target)
             for _ in range(10):
                 single.step(target, substeps=1)
-        tolerance = worlds.precision(1e-7, 5e-3)
-        error = expect_same_motion("after 60 substeps", worlds.read(), single.read(), tolerance)
+        error = expect_same_motion("after 60 substeps", worlds.read(), single.read(), worlds.precision(1e-7, 5e-3))
     return f"base positions equal to {error:.1e} m"
 
 

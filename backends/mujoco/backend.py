@@ -35,8 +35,7 @@ from ..base import (
 )
 from ..devices import find_device
 from ..motor_law import MotorLimits
-from .description import describe_model
-from .model import CONTACT_SLOTS, FOOT_SLOTS, build_models
+from .model import CONTACT_SLOTS, FOOT_SLOTS, build_models, describe_model
 from .state import RECORDED, BatchState, Records, StateLayout
 
 _STAGE = mujoco.mjtStage.mjSTAGE_VEL.value

@@ -43,8 +43,7 @@ class StateLayout:
         self.trunk_net = np.stack([columns(f"trunk_{shape}") for shape in robot.trunk_shapes])
         self.ground = columns("ground_net")
         self.points = columns("ground_each").reshape(CONTACT_SLOTS, 7)
-        watched = scene.physics.watch_penetration is not None
-        self.penetration = int(columns("penetration")[1]) if watched else None
+        self.penetration = int(columns("penetration")[1]) if scene.physics.watch_penetration is not None else None
         # a foot geom's body reports the foot's force too, which is subtracted there
         bodies = {model.body(b).id: i for i, b in enumerate(robot.collision_bodies)}
         owners = [(foot, bodies.get(model.geom(g).bodyid[0])) for foot, g in enumerate(robot.foot_geoms)]

@@ -11,6 +11,10 @@ import warp as wp
 from ..warp.structures import filled
 from .model import SharedModel
 
+_ALARMS = mujoco_warp.OverflowType
+DROPPED = int(_ALARMS.ALL & ~(_ALARMS.ITERATIONS | _ALARMS.LS_ITERATIONS))
+"""Alarms about dropped contacts or constraints: all but those of a solver at its iteration limit. ``EPA_HORIZON`` leaves a pair of
+convex shapes without a contact."""
 vec5 = wp.types.vector(length=5, dtype=wp.float32)
 """mujoco_warp's five friction coefficients of a contact: sliding twice, torsional, rolling twice."""
 

@@ -23,8 +23,7 @@ from ..warp.device import is_memory_error, memory_advice
 from ..warp.state import StateArrays
 from ..warp.structures import filled, to_warp
 from . import kernels, readout
-from .alarms import DROPPED
-from .arrays import Links, Motion, Palette, Roles, contact_arrays, motion_arrays
+from .arrays import DROPPED, Links, Motion, Palette, Roles, contact_arrays, motion_arrays
 from .masses import BATCHED_FIELDS, WorldMasses, describe_model
 from .memory import bytes_per_world
 from .model import SMALLEST_TOLERANCE, Capacity, SharedModel, buffer_capacity, build_shared_model

@@ -28,8 +28,7 @@ class WorldMasses:
     def __init__(self, shared: SharedModel, model: mujoco_warp.Model, device: torch.device) -> None:
         self._base = shared.base
         self._friction, self._reference = wp.to_torch(model.geom_friction), wp.to_torch(model.geom_solref)
-        feet = np.flatnonzero(shared.roles["foot"] >= 0)
-        self._feet = torch.tensor(feet, dtype=torch.int64, device=device)
+        self._feet = torch.tensor(np.flatnonzero(shared.roles["foot"] >= 0), dtype=torch.int64, device=device)
         self._nominal_moments = self._friction[0, self._feet, 1:].clone()
         self._nominal_time = self._reference[0, self._feet, 0].clone()
         self._mass, self._inertia = wp.to_torch(model.body_mass), wp.to_torch(model.body_inertia)

@@ -24,8 +24,7 @@ from ..warp.device import is_memory_error, memory_advice
 from ..warp.structures import filled, to_warp
 from . import kernels
 from . import readout_kernels as readout
-from .buffers import MassTensors, contact_structure
-from .description import describe_newton
+from .buffers import MassTensors, contact_structure, describe_newton
 from .model import BIRTH_HEIGHT, build_world_model
 from .solvers import SOLVERS, SolverAdapter
 
@@ -155,8 +154,7 @@ class NewtonBackend(WarpBackend):
         tables = (self._layout, active, self._contacts, self._palette, self._terrain_array)
         for substep in range(total):
             self._launch(kernels.motor_law, (n, joints), substep, *law, now, self._control.joint_f)
-            last = substep == total - 1
-            self._solver.step(*states, self._control, observe=last or sampled or watched)
+            self._solver.step(*states, self._control, observe=sampled or watched or substep == total - 1)
             self._solver.collect_overflow(active, state.overflowed)
             if watched:
                 count = self._solver.contacts.rigid_contact_max
@@ -203,8 +201,7 @@ class NewtonBackend(WarpBackend):
         self._mask[:-1].copy_(self._active)
         asked = (self._layout, self._active_array, self._request_array, *self._reset_arrays)
         written = (self._motors.arrays, *self._motions, self._ticks, self._live)
-        dim = (self.num_worlds, self._joints)
-        self._launch(kernels.reset_worlds, dim, *asked, self._model.body_com, *written)
+        self._launch(kernels.reset_worlds, (self.num_worlds, self._joints), *asked, self._model.body_com, *written)
         self._solver.reset(self._states[0], wp.from_torch(self._mask))
         self._complete_kinematics()
         self._read(self._active_array, 1, self._motions[0], self._live, contacts_of=None)

@@ -17,7 +17,7 @@ import numpy as np
 import warp as wp
 
 from ..base import CAPABILITY_NAMES, BackendError, Capability, PhysicsOptions, Scene, Support
-from ..mujoco_warp.alarms import DROPPED
+from ..mujoco_warp.arrays import DROPPED
 from ..mujoco_warp.model import SMALLEST_TOLERANCE, constraint_rows, contacts_per_world
 from ..upstream.fused_solver import FUSED_SOLVER
 from ..upstream.height_fields import HEIGHT_FIELDS

@@ -56,6 +56,16 @@ class RowFields:
     J: wp.array3d[float]
 
 
+@wp.struct
+class RowCounts:
+    """Number of each world's rows, by kind in their order."""
+
+    equality: wp.array[int]
+    friction: wp.array[int]
+    limit: wp.array[int]
+    all: wp.array[int]
+
+
 def _with_spare(kind: type, source: object) -> tuple:
     """Return a structure over the source's arrays, and one over other memory of that size."""
     return filled(kind, source), filled(kind, **{name: wp.empty_like(getattr(source, name)) for name in kind.vars})
@@ -70,6 +80,7 @@ class CanonicalOrder:
         self._geoms, self._columns = model.ngeom, data.efc.J.shape[2]
         self._contacts, self._spare_contacts = _with_spare(ContactFields, data.contact)
         self._rows, self._spare_rows = _with_spare(RowFields, data.efc)
+        self._counts = filled(RowCounts, equality=data.ne, friction=data.nf, limit=data.nl, all=data.nefc)
         self._keys = wp.zeros(2 * data.naconmax, dtype=wp.int64)
         self._order = wp.zeros(2 * data.naconmax, dtype=int)
         self._row_order = wp.zeros((data.nworld, data.njmax), dtype=int)
@@ -77,8 +88,7 @@ class CanonicalOrder:
     def sort_contacts(self, data: mujoco_warp.Data) -> None:
         """Order contacts by world, geoms and number within the pair; between collision detection and constraints."""
         count = data.naconmax
-        inputs = [data.nacon, self._geoms, self._contacts, self._keys, self._order]
-        wp.launch(contact_keys, dim=count, inputs=inputs)
+        wp.launch(contact_keys, dim=count, inputs=[data.nacon, self._geoms, self._contacts, self._keys, self._order])
         wp.utils.radix_sort_pairs(self._keys, self._order, count)
         wp.launch(move_contacts, dim=count, inputs=[data.nacon, 1, self._order, self._contacts, self._spare_contacts])
         wp.launch(move_contacts, dim=count, inputs=[data.nacon, 0, self._order, self._spare_contacts, self._contacts])
@@ -86,12 +96,11 @@ class CanonicalOrder:
     def sort_rows(self, data: mujoco_warp.Data) -> None:
         """Order each world's constraint rows by kind and contact; between constraints and solver."""
         worlds, rows = data.nworld, data.njmax
-        kinds = [data.ne, data.nf, data.nl, data.nefc]
-        wp.launch(order_rows, dim=worlds, inputs=[*kinds, rows, self._rows.id, self._row_order])
+        wp.launch(order_rows, dim=worlds, inputs=[self._counts, rows, self._rows.id, self._row_order])
         for gather, source, target in ((1, self._rows, self._spare_rows), (0, self._spare_rows, self._rows)):
             inputs = [data.nefc, gather, self._columns, self._row_order, source, target]
             wp.launch(move_rows, dim=(worlds, rows), inputs=inputs)
-        wp.launch(address_contacts, dim=(worlds, rows), inputs=[*kinds, self._rows.id, data.contact.efc_address])
+        wp.launch(address_contacts, dim=(worlds, rows), inputs=[self._counts, self._rows.id, data.contact.efc_address])
 
 
 @wp.kernel
@@ -151,19 +160,11 @@ def row_key(row: int, equality: int, friction: int, limit: int, id: int) -> wp.i
 
 
 @wp.kernel
-def order_rows(
-    equality: wp.array[int],
-    friction: wp.array[int],
-    limit: wp.array[int],
-    count: wp.array[int],
-    capacity: int,
-    id: wp.array2d[int],
-    order: wp.array2d[int],
-) -> None:
+def order_rows(counts: RowCounts, capacity: int, id: wp.array2d[int], order: wp.array2d[int]) -> None:
     """Sort a world's rows by insertion: stable, so that a contact's rows keep their order; quick for nearly sorted rows."""
     world = wp.tid()
-    e, f, j = equality[world], friction[world], limit[world]
-    for row in range(wp.min(count[world], capacity)):
+    e, f, j = counts.equality[world], counts.friction[world], counts.limit[world]
+    for row in range(wp.min(counts.all[world], capacity)):
         key = row_key(row, e, f, j, id[world, row])
         place = int(row)
         while place > 0:
@@ -199,18 +200,11 @@ def move_rows(
 
 
 @wp.kernel
-def address_contacts(
-    equality: wp.array[int],
-    friction: wp.array[int],
-    limit: wp.array[int],
-    count: wp.array[int],
-    id: wp.array2d[int],
-    address: wp.array2d[int],
-) -> None:
+def address_contacts(counts: RowCounts, id: wp.array2d[int], address: wp.array2d[int]) -> None:
     """Tell each contact where its rows are now."""
     world, row = wp.tid()
-    first = equality[world] + friction[world] + limit[world]
-    if row < first or row >= count[world]:
+    first = counts.equality[world] + counts.friction[world] + counts.limit[world]
+    if row < first or row >= counts.all[world]:
         return
     contact = id[world, row]
     number = int(0)
