@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,8 +29,8 @@ def run_consistency(request: StudyRequest, backends: str, *, out: Path | None, r
     _print_skipped(console, prepared.skipped)
     folder = out or Path("results") / f"{joined_names(request.policies)}-{bare_name(request.suite)}-consistency"
     with resumable(console, "comparing", folder, "--resume") as display:
-        command = ["gaitgauge", *sys.argv[1:]]
-        results = study(prepared, folder, resume=resume, command=command, watch=_shower(display))
+        own = ["gaitgauge", *sys.argv[1:]]
+        results = study(prepared, folder, resume=resume, command=own, watch=partial(_show, display))
     page = write_page(folder)
     if json_output:
         _print_skipped(console, results["skipped"][len(prepared.skipped) :])  # those that failed while they played
@@ -40,15 +41,10 @@ def run_consistency(request: StudyRequest, backends: str, *, out: Path | None, r
     console.say(f"results  {folder / 'consistency.json'}\npage     {page}")
 
 
-def _shower(display: ProgressDisplay) -> Callable[[StudyStatus], None]:
-    """What a study is watched with."""
-
-    def show(status: StudyStatus) -> None:
-        share = (status.part - 1 + status.done / status.episodes) / status.parts
-        text = f"run {status.part} of {status.parts}, {status.variant}: {status.done} of {status.episodes} episodes"
-        display.update(share, text, {"policy": status.policy})
-
-    return show
+def _show(display: ProgressDisplay, status: StudyStatus) -> None:
+    share = (status.part - 1 + status.done / status.episodes) / status.parts
+    text = f"run {status.part} of {status.parts}, {status.variant}: {status.done} of {status.episodes} episodes"
+    display.update(share, text, {"policy": status.policy})
 
 
 def _print_skipped(console: Terminal, skipped: Sequence[Mapping[str, str]]) -> None:
@@ -70,22 +66,18 @@ def print_study(console: Terminal, results: Mapping[str, Any]) -> None:
         for label, pair in policy["pairs"].items():
             console.say(Text.assemble((label, "bold"), f": {verdict(pair['overall'], results['margin'])}"))
         for label, health in policy["health"].items():
-            troubles = [
-                f"{health[k]} {word}"
-                for k, word in (("diverged", "diverged"), ("overflowed", "dropped contacts"))
-                if health[k]
-            ]
+            words = {"diverged": "diverged", "overflowed": "dropped contacts"}
+            troubles = [f"{health[key]} {word}" for key, word in words.items() if health[key]]
             if troubles:
-                words = f": of {health['episodes']} episodes {' and '.join(troubles)}"
-                console.say(Text.assemble((label, "red"), words))
+                found = f": of {health['episodes']} episodes {' and '.join(troubles)}"
+                console.say(Text.assemble((label, "red"), found))
     _print_skipped(console, results["skipped"])
 
 
 def _print_models(console: Terminal, models: Mapping[str, Any], results: Mapping[str, Any]) -> None:
     labels = results["compared"]
-    table = make_table(
-        f"models: largest relative difference from {models['reference']}", "field", *labels, numbers=True
-    )
+    title = f"models: largest relative difference from {models['reference']}"
+    table = make_table(title, "field", *labels, numbers=True)
     for key, row in models["fields"].items():
         cells: list[str | Text] = []
         for label in labels:
@@ -95,8 +87,7 @@ def _print_models(console: Terminal, models: Mapping[str, Any], results: Mapping
             elif found["agrees"]:
                 cells.append("same")
             else:
-                relative = found["relative"]
-                shown = "–" if relative is None else f"{relative:.2g}"
+                shown = "–" if found["relative"] is None else f"{found['relative']:.2g}"
                 cells.append(Text(f"{shown} ({found['entry']})", "red"))
         table.add_row(FIELD_LABELS[key], *cells)
     if models["fields"]:
@@ -144,9 +135,8 @@ def _print_pair(console: Terminal, reference: str, label: str, pair: Mapping[str
             *("" if o is None else f"{100 * o['same']:.0f} %" for o in outcomes),
         )
     console.print(table)
-    table = make_table(
-        "metrics, overall", "metric", reference, label, "difference", "95 % interval", "effect size", numbers=True
-    )
+    of_metric = ("metric", reference, label, "difference", "95 % interval", "effect size")
+    table = make_table("metrics, overall", *of_metric, numbers=True)
     for name, row in pair["overall"]["metrics"].items():
         size = row["effect_size"]
         table.add_row(
@@ -170,18 +160,10 @@ def _print_attribution(console: Terminal, rows: Sequence[Mapping[str, Any]]) -> 
         if row["not_run"] is not None:
             table.add_row(row["title"], row["engine"], "not run")
             continue
-        cells = []
-        for engine in engines:
-            to = row["to"].get(engine)
-            change = "" if to is None else f"{_small(to['gap_before'])} → {_small(to['gap_after'])}, {cause(to)}"
-            cells.append(change)
-        table.add_row(
-            row["title"],
-            row["engine"],
-            _signed(row["difference"]["value"]),
-            _range(row["difference"]["interval"]),
-            *cells,
-        )
+        found = [row["to"].get(engine) for engine in engines]
+        gaps = [to and f"{_small(to['gap_before'])} → {_small(to['gap_after'])}, {cause(to)}" for to in found]
+        difference, interval = _signed(row["difference"]["value"]), _range(row["difference"]["interval"])
+        table.add_row(row["title"], row["engine"], difference, interval, *gaps)
     console.print(table)
     for row in rows:
         if row["not_run"] is not None:
@@ -189,19 +171,12 @@ def _print_attribution(console: Terminal, rows: Sequence[Mapping[str, Any]]) -> 
 
 
 def _print_gaps(console: Terminal, policy: Mapping[str, Any]) -> None:
-    table = make_table(
-        "gap: mean |difference| of an episode's quality", "engines", "gap", "95 % interval", numbers=True
-    )
-    for row in policy["gaps"]:
-        low, high = row["overall"]["gap"]["interval"]
-        table.add_row(
-            " – ".join(row["pair"]),
-            Text(_small(row["overall"]["gap"]["value"]), "bold"),
-            f"{_small(low)} to {_small(high)}",
-        )
-    floor = policy["floor"]["overall"]["gap"]
-    low, high = floor["interval"]
-    table.add_row("floor: the reference against itself", _small(floor["value"]), f"{_small(low)} to {_small(high)}")
+    title = "gap: mean |difference| of an episode's quality"
+    table = make_table(title, "engines", "gap", "95 % interval", numbers=True)
+    rows = [(" – ".join(row["pair"]), row["overall"]["gap"], "bold") for row in policy["gaps"]]
+    for name, gap, style in (*rows, ("floor: the reference against itself", policy["floor"]["overall"]["gap"], "")):
+        low, high = map(_small, gap["interval"])
+        table.add_row(name, Text(_small(gap["value"]), style), f"{low} to {high}")
     console.print(table)
 
 

@@ -293,14 +293,7 @@ def _writable(folder: Path) -> Finding:
 
 
 CHECKS: tuple[Callable[[], Iterator[Finding]], ...] = (
-    check_python,
-    check_packages,
-    check_gpu,
-    check_warp,
-    check_mujoco,
-    check_rendering,
-    check_display,
-    check_ffmpeg,
-    check_room,
-)
+    check_python, check_packages, check_gpu, check_warp, check_mujoco,
+    check_rendering, check_display, check_ffmpeg, check_room,
+)  # fmt: skip
 """All checks, in the order of the table."""

@@ -52,8 +52,7 @@ def run_play(asked: PlayRequest) -> None:
     if viewer == "viser":
         from .browser_viewer import Choice, serve
 
-        chosen = Choice(terrain=asked.terrain, level=level, policies=asked.policies)
-        serve(sessions, maker, chosen, asked)
+        serve(sessions, maker, Choice(terrain=asked.terrain, level=level, policies=asked.policies), asked)
         return
     with ExitStack() as stack:
         for session in sessions:

@@ -56,11 +56,8 @@ class Draft:
     @property
     def guesses(self) -> list[str]:
         """Return the guesses as sentences."""
-        return [
-            f"{e.key} = {' '.join(_toml(e.value).split())} ({e.remark})"
-            for e in self.entries
-            if e.remark.startswith(_GUESSED)
-        ]
+        guessed = [entry for entry in self.entries if entry.remark.startswith(_GUESSED)]
+        return [f"{each.key} = {' '.join(_toml(each.value).split())} ({each.remark})" for each in guessed]
 
     def text(self, mjcf: str) -> str:
         """Return the text of the ``robot.toml``; ``mjcf`` is the model's path relative to it."""

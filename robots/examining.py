@@ -222,8 +222,7 @@ def stand_still(spec: mujoco.MjSpec, pose: Mapping[str, float], motors: JointPar
 
 
 def _mirror(robot: Robot) -> str:
-    image = mirror_image(robot)
-    pairs = sorted({tuple(sorted((i, j))) for i, j in enumerate(image.foot)})
+    pairs = sorted({tuple(sorted((i, j))) for i, j in enumerate(mirror_image(robot).foot)})
     names = ", ".join(" and ".join(dict.fromkeys(robot.foot_names[i] for i in pair)) for pair in pairs)
     return f"left and right are mirror images: {names}"
 

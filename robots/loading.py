@@ -224,14 +224,11 @@ def _elements(file: Path, copies: float) -> list[_Element]:
         found.append((tag, attributes, around[-1]) if tag == "replicate" or not own else ("body", attributes, made))
         around.append(made)
 
-    def end(tag: str) -> None:
-        around.pop()
-
     def entity(*_: object) -> None:  # a few lines of entities can stand for gigabytes
         raise RobotError(f"'{one_line(file)}' defines XML entities, which no robot needs; take them out")
 
     parser = expat.ParserCreate()
-    parser.StartElementHandler, parser.EndElementHandler = begin, end
+    parser.StartElementHandler, parser.EndElementHandler = begin, lambda tag: around.pop()
     parser.EntityDeclHandler = entity
     try:
         parser.Parse(data, True)
@@ -256,9 +253,8 @@ def _by_ending(table: Mapping[str, Any], joints: list[str], where: str) -> list[
     for ending in table:
         if not any(_fits(ending, joint) for joint in joints):
             hint = did_you_mean(ending, [j.removesuffix(_JOINT_ENDING) for j in joints])
-            raise RobotError(
-                f"{where} has the key {shown(ending)}, which is neither a joint nor a joint's ending{hint}"
-            )
+            unknown = f"the key {shown(ending)}, which is neither a joint nor a joint's ending{hint}"
+            raise RobotError(f"{where} has {unknown}")
     values = []
     for joint in joints:
         fitting = [ending for ending in table if _fits(ending, joint)]

@@ -87,11 +87,14 @@ class Survey:
         model, legs = self.model, []
         moving = {int(b) for b in model.jnt_bodyid[self.hinges]}
         for tip in sorted(moving):
-            below = [b for b in range(model.nbody) if b != tip and tip in self._ancestors(b)]
-            if moving.intersection(below):
+            below = {tip}
+            for body in range(tip + 1, model.nbody):  # parents come first
+                if int(model.body_parentid[body]) in below:
+                    below.add(body)
+            if moving & below != {tip}:
                 continue
             chain = joint_chain(model, tip, self.base)
-            shapes = [g for g in range(model.ngeom) if int(model.geom_bodyid[g]) in (tip, *below) and solid(model, g)]
+            shapes = [g for g in range(model.ngeom) if int(model.geom_bodyid[g]) in below and solid(model, g)]
             if len(chain) < 2 or not shapes:
                 continue
             round_ones = [g for g in shapes if model.geom_type[g] == self.mujoco.mjtGeom.mjGEOM_SPHERE] or shapes
@@ -128,13 +131,6 @@ class Survey:
         feet |= {foot: self.model.geom(name).id for foot, name in names.items()}
         return [replace(leg, foot=feet[leg.foot]) for leg in legs]
 
-    def _ancestors(self, body: int) -> list[int]:
-        found = []
-        while body:
-            body = int(self.model.body_parentid[body])
-            found.append(body)
-        return found
-
     def leg_length(self, leg: Leg) -> float:
         """Return the length of a stretched leg [m], without the link that swings it sideways."""
         return stretched_length(self.data, self._swinging(leg), leg.foot)
@@ -158,8 +154,7 @@ class Survey:
         return angles, "guessed: knees bent, feet below the hips, a little behind them where knees are behind"
 
     def _within(self, angles: dict[int, float]) -> dict[int, float]:
-        bounds = {j: self._bounds(j) for j in angles}
-        return {j: float(np.clip(angle, *bounds[j])) for j, angle in angles.items()}
+        return {j: float(np.clip(angle, *self._bounds(j))) for j, angle in angles.items()}
 
     def _bounds(self, joint: int) -> tuple[float, float]:
         low, high = self.model.jnt_range[joint] if self.model.jnt_limited[joint] else (-_WIDEST, _WIDEST)
@@ -190,8 +185,7 @@ class Survey:
                 reach(swing)
                 if in_front == bool(self.data.xanchor[knee][0] > self.data.xanchor[hip][0]):
                     break
-            wrong = apart + abs(lengths[nearest] - wanted)
-            found.append((round(wrong, 2), in_front, {knee: bent, hip: swing}))
+            found.append((round(apart + abs(lengths[nearest] - wanted), 2), in_front, {knee: bent, hip: swing}))
         # a leg that cannot bend so, or a foot that cannot come below its hip, is worse than a knee in front
         return min(found, key=lambda each: each[:2])[2]
 
@@ -291,7 +285,7 @@ class Survey:
             a is not None and k > 0.0 and model.actuator_biasprm[a, 1] == -model.actuator_gainprm[a, 0]
             for a, k in zip(servos, kp, strict=True)
         )
-        sizes = "guessed from weight and leg length"
+        sizes, by_length = "guessed from weight and leg length", "guessed from leg length"
         stiffness: Remarked = (_round(stiffer * _STIFFNESS * strength), sizes)
         if position:
             stiffness = (kp, "of the model's position actuators")
@@ -310,14 +304,8 @@ class Survey:
             "armature": armature,
             "joint_damping": (model.dof_damping[dofs].tolist(), "of the model"),
             "friction_loss": (model.dof_frictionloss[dofs].tolist(), "of the model"),
-            "full_torque_speed": (
-                _round(_FULL_SPEED / length),
-                "guessed from leg length: up to here the torque is there",
-            ),
-            "no_load_speed": (
-                _round(_NO_LOAD_SPEED / length),
-                "guessed from leg length: from here the motor drives no more",
-            ),
+            "full_torque_speed": (_round(_FULL_SPEED / length), f"{by_length}: up to here the torque is there"),
+            "no_load_speed": (_round(_NO_LOAD_SPEED / length), f"{by_length}: from here the motor drives no more"),
         }
 
     def _gains(self, actuator: int | None) -> tuple[float, float]:

@@ -4,12 +4,5 @@ from .base import Box, HeightField, Pose, Terrain
 from .registry import TerrainError, gauge_terrain_names, make_terrain, terrain_names
 
 __all__ = [
-    "Box",
-    "HeightField",
-    "Pose",
-    "Terrain",
-    "TerrainError",
-    "gauge_terrain_names",
-    "make_terrain",
-    "terrain_names",
-]
+    "Box", "HeightField", "Pose", "Terrain", "TerrainError", "gauge_terrain_names", "make_terrain", "terrain_names",
+]  # fmt: skip

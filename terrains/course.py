@@ -69,14 +69,10 @@ def _block(middle: float, length: float, width: float, top: float) -> Box:
 
 def _ramp(x: float, z: float, stretch: Stretch, width: float) -> Box:
     """Return a plate with an upper face from (x, z) to the stretch's end."""
-    angle = math.atan2(stretch.rise, stretch.length)
-    down = 0.5 * _THICKNESS
+    angle, down = math.atan2(stretch.rise, stretch.length), 0.5 * _THICKNESS
+    middle = (x + 0.5 * stretch.length, z + 0.5 * stretch.rise)
     return Box(
-        center=(
-            x + 0.5 * stretch.length + down * math.sin(angle),
-            0.0,
-            z + 0.5 * stretch.rise - down * math.cos(angle),
-        ),
+        center=(middle[0] + down * math.sin(angle), 0.0, middle[1] - down * math.cos(angle)),
         half_size=(0.5 * stretch.length / math.cos(angle), 0.5 * width, down),
         quaternion=(math.cos(0.5 * angle), 0.0, -math.sin(0.5 * angle), 0.0),
     )

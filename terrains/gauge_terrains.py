@@ -79,13 +79,9 @@ def stairs(level: int, *, backward: bool = False) -> Terrain:
         backward: the robot starts turned around and walks backwards up the same stairs.
     """
     riser = STAIR_RISERS[level - 1]
-    steps = tuple(
-        Box(
-            center=(STAIR_TREAD * (step + 0.5), 0.0, (step + 0.5) * riser),
-            half_size=(_HALF_TREAD_BOX, 5.0, riser / 2),
-        )
-        for step in range(STAIR_COUNT)
-    )
+    half = (_HALF_TREAD_BOX, 5.0, riser / 2)
+    middles = [(STAIR_TREAD * (step + 0.5), 0.0, (step + 0.5) * riser) for step in range(STAIR_COUNT)]
+    steps = tuple(Box(center=middle, half_size=half) for middle in middles)
     target_z = 15 * riser + 0.15
     return _levelled(
         "stairs",

@@ -53,9 +53,8 @@ def box_top(box: Box, x: FloatArray, y: FloatArray) -> FloatArray:
         # Coordinate along the box's axis: start at the height of the centre, climb by `rise` per metre of height.
         start = rotation[0, axis] * offset_x + rotation[1, axis] * offset_y
         rise = rotation[2, axis]
-        reach = half + EDGE_TOLERANCE
         if abs(rise) < 1e-12:
-            inside &= np.abs(start) <= reach
+            inside &= np.abs(start) <= half + EDGE_TOLERANCE
             continue
         middle, span = -start / rise, half / abs(rise)
         # The tolerance decides only whether a line hits, not the height at which it leaves.
@@ -75,11 +74,9 @@ def height_field_top(field: HeightField, x: FloatArray, y: FloatArray) -> FloatA
     # Grid coordinates: columns count along +x, rows along +y, from the corner of lowest x and y.
     along_x = (x - field.center[0] + field.half_size[0]) * ((columns - 1) / (2.0 * field.half_size[0]))
     along_y = (y - field.center[1] + field.half_size[1]) * ((rows - 1) / (2.0 * field.half_size[1]))
-    inside = (np.abs(x - field.center[0]) <= field.half_size[0] + EDGE_TOLERANCE) & (
-        np.abs(y - field.center[1]) <= field.half_size[1] + EDGE_TOLERANCE
-    )
-    along_x = np.where(inside, along_x, 0.0)
-    along_y = np.where(inside, along_y, 0.0)
+    reach_x, reach_y = (half + EDGE_TOLERANCE for half in field.half_size)
+    inside = (np.abs(x - field.center[0]) <= reach_x) & (np.abs(y - field.center[1]) <= reach_y)
+    along_x, along_y = np.where(inside, along_x, 0.0), np.where(inside, along_y, 0.0)
     column = np.clip(np.floor(along_x), 0, columns - 2).astype(np.int64)
     row = np.clip(np.floor(along_y), 0, rows - 2).astype(np.int64)
     u, v = along_x - column, along_y - row

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from importlib.metadata import EntryPoint
 
 from ..files.parsing import did_you_mean, one_line
 from ..files.plugins import guarded, load_plugin, origin, plugins
@@ -66,11 +65,7 @@ def make_terrain(name: str, level: int | None = None) -> Terrain:
     if plugin is None:
         hint = did_you_mean(name, terrain_names()) or f"; choose one of: {', '.join(terrain_names())}"
         raise TerrainError(f"unknown terrain '{one_line(name, 80)}'{hint}")
-    return _from_plugin(plugin, 0 if level is None else level)
-
-
-def _from_plugin(plugin: EntryPoint, level: int) -> Terrain:
-    terrain = guarded(plugin, TerrainError, load_plugin(plugin, TerrainError), level)
+    terrain = guarded(plugin, TerrainError, load_plugin(plugin, TerrainError), level or 0)
     if not isinstance(terrain, Terrain):
         raise TerrainError(f"{origin(plugin)} must return a Terrain, not {type(terrain).__name__}")
     return terrain

@@ -163,8 +163,7 @@ def make_tile(kind: str, level: int, seed: int = 0, *, shape: TileShape = DEFAUL
         ground = Terrain(name=f"tile_{kind}", family="tile_field", level=level, height_field=built)
     else:
         ground = Terrain(name=f"tile_{kind}", family="tile_boxes", level=level, boxes=built)
-    start = Pose(position=(0.0, 0.0, float(ground.height(0.0, 0.0))))
-    return replace(ground, spawns={"train": start})
+    return replace(ground, spawns={"train": Pose(position=(0.0, 0.0, float(ground.height(0.0, 0.0))))})
 
 
 def _at(difficulty: float, pair: tuple[float, float]) -> float:
