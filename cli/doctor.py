@@ -84,9 +84,6 @@ def examine(*, json_output: bool = False) -> bool:
     return counts[PROBLEM] == 0
 
 
-# ---- packages -------------------------------------------------------------------------------------------------------
-
-
 def check_python() -> Iterator[Finding]:
     """Check the interpreter's version."""
     found = f"{platform.python_version()} in {sys.prefix}"
@@ -120,8 +117,6 @@ def check_packages() -> Iterator[Finding]:
             found = f"{present}, but {wanted.specifier} is needed"
             yield Finding(wanted.name, PROBLEM, found, f"pip install '{line}'")
 
-
-# ---- devices --------------------------------------------------------------------------------------------------------
 
 _TORCH_PROBE = """
 import json, torch
@@ -207,8 +202,6 @@ def check_mujoco() -> Iterator[Finding]:
         yield Finding(what, PROBLEM, f"package {package} loads library {library}", advice)
 
 
-# ---- pictures -------------------------------------------------------------------------------------------------------
-
 _PACKAGES_OF = {"egl": "libegl1 (and a GPU driver or libgl1-mesa-dri)", "osmesa": "libosmesa6"}
 
 
@@ -250,9 +243,6 @@ def check_ffmpeg() -> Iterator[Finding]:
         yield Finding("ffmpeg", WARNING, "no program for this platform", advice)
         return
     yield Finding("ffmpeg", OK, program)
-
-
-# ---- room -----------------------------------------------------------------------------------------------------------
 
 
 def check_room() -> Iterator[Finding]:

@@ -93,8 +93,6 @@ def _shots(
             while session.time < (frame + 1) * FRAME_TIME - 1e-9:  # policies may have periods of their own
                 session.step(command or session.autopilot())
         if frame % every == 0:
-            poses = []
-            for session, follower in zip(sessions, followers, strict=True):
-                position = session.position()
-                poses.append((position, follower.follow(position, FRAME_TIME * every)))
+            positions = [session.position() for session in sessions]
+            poses = [(p, each.follow(p, FRAME_TIME * every)) for p, each in zip(positions, followers, strict=True)]
             yield Shot(poses=poses, note=(frame, [session.readout() for session in sessions]))

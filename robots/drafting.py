@@ -132,8 +132,8 @@ def _draft(path: Path, name: str | None, home: Path) -> str:
         Entry("action_scale", 0.25, f"{_GUESSED}: how far an output of 1 moves a joint's target [rad]"),
         Entry("default_parameters", "gauge"),
     ]
-    for key, (value, remark) in _standing_motors(survey, pose, joints, length).items():
-        entries.append(Entry(f"parameters.gauge.{key}", value, remark))
+    motors = _standing_motors(survey, pose, joints, length)
+    entries += [Entry(f"parameters.gauge.{key}", value, remark) for key, (value, remark) in motors.items()]
     text = ""
     if survey.renamed:
         for kind in ("meshdir", "texturedir"):

@@ -110,11 +110,10 @@ def obstacle(level: int) -> Terrain:
 
 def wave(level: int) -> Terrain:
     """Build the sum of a sine along x (wavelength 2 m) and a cosine along y (8/3 m), between 0 and 0.08 x level [m]."""
-    field = HeightField(center=(5.0, 0.0), half_size=(5.0, 5.0), heights=wave_heights(level), base=0.1)
     return _levelled(
         "wave",
         level,
-        height_field=field,
+        height_field=HeightField(center=(5.0, 0.0), half_size=(5.0, 5.0), heights=wave_heights(level), base=0.1),
         search=(1.5, 1.25, 0.0),
         evaluation=(4.55, 0.0, 0.65 - 0.075 * (10 - level)),
         target=(6.5, -2.65, _WAVE_HEIGHT_PER_LEVEL * level),

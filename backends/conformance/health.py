@@ -10,7 +10,7 @@ from .check import check
 from .contact import lay_on_back
 from .kinematics import base_up
 from .reference import Reference, level_stance
-from .stepping import expect_same_motion, stand, wave
+from .stepping import expect_same_motion, stand, twins, wave
 
 _BOX = Box(center=(0.0, 0.0, 0.1), half_size=(0.6, 0.6, 0.1))
 BLOCK = Terrain(name="conformance_block", family="block", boxes=(_BOX,))
@@ -73,9 +73,7 @@ def penetration_watch(bench: Bench) -> str:
 @check("health/divergence")
 def divergence(bench: Bench) -> str:
     """An infinite velocity or a NaN target makes its world diverged; other worlds go on untouched, a reset heals the world."""
-    with bench.worlds() as worlds, bench.worlds() as untouched:
-        for each in (worlds, untouched):
-            stand(bench, each)
+    with twins(bench) as (worlds, untouched):
         target = wave(worlds, 0)
         poisoned = target.copy()
         poisoned[1] = np.nan
@@ -95,8 +93,8 @@ def divergence(bench: Bench) -> str:
         expect(~state.diverged[~broken], f"diverged is {state.diverged}, but nothing happened to worlds 2 and 3")
         tolerance = worlds.precision(1e-9, 2e-3)
         expect_same_motion("beside diverged worlds", state, expected, tolerance, ~broken)
-        stand(bench, worlds)
-        stand(bench, untouched)
+        for each in (worlds, untouched):
+            stand(bench, each)
         expect(not worlds.read().diverged.any(), "diverged is not cleared by a reset")
         for each in (worlds, untouched):
             each.step(target)

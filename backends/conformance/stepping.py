@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import fields
 from types import SimpleNamespace
 from typing import Any
@@ -33,6 +34,17 @@ def stand(bench: Bench, worlds: Worlds, *, speed: np.ndarray = SPEEDS, held: boo
         base_linear_velocity=speed,
         held_target=worlds.default_pose if held else None,
     )
+
+
+@contextmanager
+def twins(bench: Bench, *, periods: int = 0) -> Iterator[tuple[Worlds, Worlds]]:
+    """Build the same worlds twice, which have stood for so many control periods."""
+    with bench.worlds() as first, bench.worlds() as second:
+        for each in (first, second):
+            stand(bench, each)
+            for period in range(periods):
+                each.step(wave(each, period))
+        yield first, second
 
 
 def wave(worlds: Worlds, period: int) -> np.ndarray:
@@ -68,9 +80,7 @@ def _difference(a: np.ndarray, b: np.ndarray) -> float:
 @check("stepping/substeps")
 def single_substeps(bench: Bench) -> str:
     """A control period equals its substeps taken one by one, contacts included."""
-    with bench.worlds() as worlds, bench.worlds() as single:
-        for each in (worlds, single):
-            stand(bench, each)
+    with twins(bench) as (worlds, single):
         for period in range(6):
             target = wave(worlds, period)
             worlds.step(target)
@@ -84,10 +94,7 @@ def single_substeps(bench: Bench) -> str:
 def sample_at(bench: Bench) -> str:
     """The sample is the state after the substep that each world asked for, forces included."""
     at = np.array([1, 4, 10, 7])
-    with bench.worlds() as worlds, bench.worlds() as single:
-        for each in (worlds, single):
-            stand(bench, each)
-            each.step(wave(each, 0))
+    with twins(bench, periods=1) as (worlds, single):
         target = wave(worlds, 1)
         worlds.step(target, sample_at=at)
         history = []
@@ -115,10 +122,7 @@ def sample_at(bench: Bench) -> str:
 def step_mask(bench: Bench) -> str:
     """Worlds outside of a step's mask do not change at all, their targets included."""
     stepped = np.array([True, False, True, False])
-    with bench.worlds() as worlds, bench.worlds() as other:
-        for each in (worlds, other):
-            stand(bench, each)
-            each.step(wave(each, 0))
+    with twins(bench, periods=1) as (worlds, other):
         before = worlds.read()
         worlds.step(wave(worlds, 5), worlds=stepped)
         after = worlds.read()
@@ -143,10 +147,7 @@ def step_mask(bench: Bench) -> str:
 def reset_mask(bench: Bench) -> str:
     """Worlds outside of a reset's mask do not change at all and go on undisturbed."""
     chosen = np.array([False, True, False, True])
-    with bench.worlds() as worlds, bench.worlds() as other:
-        for each in (worlds, other):
-            stand(bench, each)
-            each.step(wave(each, 0))
+    with twins(bench, periods=1) as (worlds, other):
         before = worlds.read()
         worlds.reset(chosen, base_position=(2.0, 2.0, 2.0))
         after = worlds.read()

@@ -105,8 +105,6 @@ class MujocoBackend(PhysicsBackend):
         self._rooms: dict[tuple[int, int], tuple[Array, Records]] = {}
         self.reset(replace(self.standing(), held_target=None))
 
-    # ---- layout -------------------------------------------------------------------------------------------------
-
     def _index_model(self, model: mujoco.MjModel) -> None:
         """Find the robot's base, joints and bodies in MuJoCo's arrays."""
         robot = self.scene.robot
@@ -119,8 +117,6 @@ class MujocoBackend(PhysicsBackend):
         self._joint_v = np.array([model.joint(j).dofadr[0] for j in robot.joint_names])
         self._bodies = np.array([model.body(b).id for b in robot.collision_bodies])
         self._feet = np.array([model.geom(name).id for name in robot.foot_geoms])
-
-    # ---- reading ------------------------------------------------------------------------------------------------
 
     @property
     def state(self) -> PhysicsState:

@@ -42,13 +42,12 @@ class MujocoWarpBackend(WarpBackend):
     @classmethod
     def capabilities(cls) -> Mapping[str, Capability]:
         """Declare every capability, in single precision."""
-        entries = {name: Capability(support=Support.EXACT) for name in CAPABILITY_NAMES}
-        entries["penetration"] = Capability(support=Support.EXACT, note="seen one substep late")
-        limit = "at most 4 contacts for each geom, where MuJoCo keeps up to 50"
-        entries["height_field"] = Capability(support=Support.EXACT, note=limit)
-        sort = "on a GPU with PhysicsOptions.deterministic, which sorts contacts every substep"
-        entries["deterministic"] = Capability(support=Support.EXACT, note=sort)
-        return entries
+        notes = {
+            "penetration": "seen one substep late",
+            "height_field": "at most 4 contacts for each geom, where MuJoCo keeps up to 50",
+            "deterministic": "on a GPU with PhysicsOptions.deterministic, which sorts contacts every substep",
+        }
+        return {name: Capability(support=Support.EXACT, note=notes.get(name, "")) for name in CAPABILITY_NAMES}
 
     @classmethod
     def solver_settings(cls, physics: PhysicsOptions) -> Mapping[str, float | str]:
@@ -78,8 +77,6 @@ class MujocoWarpBackend(WarpBackend):
             processors = wp.device_from_torch(self.device).sm_count
             per_world = bytes_per_world(self._shared.model, capacity, scene.num_worlds, processors)
             raise BackendError(memory_advice(scene.num_worlds, self.device, free, per_world)) from error
-
-    # ---- building -------------------------------------------------------------------------------------------------
 
     def _build(self, shared: SharedModel, capacity: Capacity) -> None:
         """Build model, data and buffers on the device."""

@@ -100,8 +100,6 @@ class NewtonBackend(WarpBackend):
             gc.collect()
         return memory_advice(self.num_worlds, self.device, start, max(1.0, (used[1] - used[0]) / 448))
 
-    # ---- building -----------------------------------------------------------------------------------------------
-
     def _build(self) -> None:
         """Make model, solver, tensors and the structures for the kernels."""
         scene, on, n = self.scene, self._warp_device, self.num_worlds

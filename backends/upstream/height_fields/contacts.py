@@ -8,6 +8,7 @@ from mujoco_warp._src.collision_core import contact_material_params, write_conta
 from mujoco_warp._src.math import make_frame
 from mujoco_warp._src.types import vec5
 
+from ..order import ContactFields
 from .kernels import Lists, Shapes, Touch, margin_gap
 
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
@@ -36,30 +37,18 @@ class Materials:
 
 
 @wp.struct
-class Contacts:
-    """mujoco_warp's contacts, by its own names."""
+class Room:
+    """mujoco_warp's room for contacts, by its own names."""
 
     naconmax: int
-    dist: wp.array[float]
-    pos: wp.array[wp.vec3]
-    frame: wp.array[wp.mat33]
-    includemargin: wp.array[float]
-    friction: wp.array[vec5]
-    solref: wp.array[wp.vec2]
-    solreffriction: wp.array[wp.vec2]
-    solimp: wp.array[vec5]
-    dim: wp.array[int]
-    geom: wp.array[wp.vec2i]
-    efc_address: wp.array2d[int]
-    worldid: wp.array[int]
-    type: wp.array[int]
-    geomcollisionid: wp.array[int]
-    adhesion: wp.array[float]
     nacon: wp.array[int]
+    efc_address: wp.array2d[int]
 
 
 @wp.func
-def write_touch(shapes: Shapes, materials: Materials, contacts: Contacts, pair: int, number: int, touch: Touch) -> None:
+def write_touch(
+    shapes: Shapes, materials: Materials, contacts: ContactFields, room: Room, pair: int, number: int, touch: Touch
+) -> None:
     """Write one more of mujoco_warp's contacts."""
     geoms, ids, world = shapes.collision_pair[pair], shapes.collision_pairid[pair], shapes.collision_worldid[pair]
     margin, gap = margin_gap(shapes, pair)
@@ -70,16 +59,16 @@ def write_touch(shapes: Shapes, materials: Materials, contacts: Contacts, pair: 
         materials.pair_adhesion, materials.pair_friction, geoms, ids[0], world,
     )  # fmt: skip
     write_contact(
-        contacts.naconmax, number, touch.distance, touch.position, make_frame(touch.normal), margin, gap,
+        room.naconmax, number, touch.distance, touch.position, make_frame(touch.normal), margin, gap,
         condim, friction, solref, solreffriction, solimp, adhesion, geoms, ids, world,
         contacts.dist, contacts.pos, contacts.frame, contacts.includemargin, contacts.friction, contacts.solref,
-        contacts.solreffriction, contacts.solimp, contacts.dim, contacts.geom, contacts.efc_address, contacts.worldid,
-        contacts.type, contacts.geomcollisionid, contacts.adhesion, contacts.nacon,
+        contacts.solreffriction, contacts.solimp, contacts.dim, contacts.geom, room.efc_address, contacts.worldid,
+        contacts.type, contacts.geomcollisionid, contacts.adhesion, room.nacon,
     )  # fmt: skip
 
 
 @wp.kernel
-def write_contacts(shapes: Shapes, lists: Lists, materials: Materials, contacts: Contacts) -> None:
+def write_contacts(shapes: Shapes, lists: Lists, materials: Materials, contacts: ContactFields, room: Room) -> None:
     """Write four of each pair's contacts: the deepest, the farthest from it, and two that span the widest area with these."""
     pair = wp.tid()
     if pair >= shapes.ncollision[0]:
@@ -104,7 +93,7 @@ def write_contacts(shapes: Shapes, lists: Lists, materials: Materials, contacts:
     while chosen >= 0 and number < 4:
         given = lists.prisms[first + chosen][1]
         lists.prisms[first + chosen] = wp.vec2i(-1, given)  # marks a chosen contact
-        write_touch(shapes, materials, contacts, pair, number, lists.touches[given])
+        write_touch(shapes, materials, contacts, room, pair, number, lists.touches[given])
         position = lists.touches[given].position
         if number == 0:
             start = position

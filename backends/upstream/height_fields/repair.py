@@ -32,9 +32,10 @@ from mujoco_warp._src.math import upper_trid_index
 from mujoco_warp._src.types import MJ_MAX_EPAFACES, MJ_MAX_EPAHORIZON, GeomType, OverflowType
 
 from ...warp.structures import filled
+from ..order import ContactFields
 from ..repair import Repair
 from . import kernels
-from .contacts import Contacts, Materials, write_contacts
+from .contacts import Materials, Room, write_contacts
 from .prisms import support
 
 _PRISMS = (8, 64)
@@ -105,7 +106,7 @@ def collide_fields(model: Model, data: Data, context: CollisionContext, kinds: t
     testing = multiprocessors * _TEST_THREADS or _SERIAL_THREADS
     searching = max(1, min(multiprocessors * SEARCH_THREADS or _SERIAL_THREADS, data.naccdmax))
     shapes = filled(kernels.Shapes, model, model.opt, data, context)
-    materials, contacts = filled(Materials, model), filled(Contacts, data.contact, data)
+    written = [filled(Materials, model), filled(ContactFields, data.contact), filled(Room, data.contact, data)]
     lists = empty_lists(data.naconmax, data.nworld)
     scratch = scratch_memory(searching, model.opt.ccd_iterations)
     test_prisms, search_prisms = kernels.prism_kernels(kinds)
@@ -117,7 +118,7 @@ def collide_fields(model: Model, data: Data, context: CollisionContext, kinds: t
     inputs = [shapes, lists, scratch, searching, *iterations, warn_horizon]
     # in small blocks, so that few searches still reach many processors
     wp.launch(search_prisms, dim=searching, inputs=inputs, block_dim=_WARP)
-    wp.launch(write_contacts, dim=data.naconmax, inputs=[shapes, lists, materials, contacts])
+    wp.launch(write_contacts, dim=data.naconmax, inputs=[shapes, lists, *written])
 
 
 def convex_narrowphase(
