@@ -295,6 +295,8 @@ class PhysicsBackend(ABC):
 
     name: ClassVar[str]
     """Registry name, for example ``mujoco``."""
+    family: ClassVar[str] = ""
+    """Contact model for people; engines of one family are relatives. Empty for an engine of its own family."""
 
     scene: Scene
     device: torch.device

@@ -184,6 +184,7 @@ def studies() -> None:
         ("trials", "trials", "trials/trial.html", ("trial", "pretrained")),
         ("latent", "latent", "latent/latent.html", ("latent", "pretrained", "--robots", "2")),
         ("consistency", "consistency", "consistency/consistency.html", ("consistency", "pretrained", *engines)),
+        ("jury", "jury", "jury/jury.html", ("jury", "pretrained")),
     ):
         run(name, *words, "--out", "board.html" if name == "board" else name)
         shoot((WORK / page).as_uri(), f"{file}.png")

@@ -15,8 +15,8 @@ from ..files.parsing import NotNegative, Positive, Share, Text
 class Metrics:
     """The metrics of a suite, and how they are taken."""
 
-    weights: Annotated[Mapping[str, Annotated[float, Field(gt=0.0, le=1000.0)]], Field(min_length=1)]
-    """Exponent of each metric in the quality of a sample; its keys are the suite's metrics."""
+    weights: Annotated[Mapping[str, Annotated[float, Field(ge=0.0, le=1000.0)]], Field(min_length=1)]
+    """Exponent of each metric in the quality of a sample; its keys are the suite's metrics. A metric of weight 0 is measured alone."""
     interval: Annotated[int, Field(ge=1, le=100_000)]
     """Substeps between samples."""
     clock: Literal["run", "reset"]

@@ -427,6 +427,7 @@ def _check(suite: Suite, source: str) -> None:
             f"matrix.terrains has the unknown terrain {shown(name)}{did_you_mean(name, grounds) or ';'} choose from "
             f"{', '.join(grounds)}"
         ] = name in grounds
+    rules["metrics.weights are all zero; give at least one metric a weight above 0"] = any(metrics.weights.values())
     for rule, kept in rules.items():
         if not kept:
             raise SuiteError(f"{source}: {rule}")

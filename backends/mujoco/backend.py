@@ -50,6 +50,7 @@ class MujocoBackend(PhysicsBackend):
     """MuJoCo (C engine) on the CPU. Results do not depend on the number of threads nor on the other worlds."""
 
     name: ClassVar[str] = "mujoco"
+    family: ClassVar[str] = "MuJoCo"
     parallel_processes: ClassVar[bool] = True
 
     @classmethod

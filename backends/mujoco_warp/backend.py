@@ -36,6 +36,7 @@ class MujocoWarpBackend(WarpBackend):
     """mujoco_warp on a CUDA device, or on the CPU for tests."""
 
     name: ClassVar[str] = "mujoco-warp"
+    family: ClassVar[str] = "MuJoCo"
     state_stays: ClassVar[bool] = True
     always_masked: ClassVar[bool] = True
 

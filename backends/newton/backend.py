@@ -33,6 +33,7 @@ class NewtonBackend(WarpBackend):
     """N worlds of one robot in Newton."""
 
     name: ClassVar[str] = "newton"
+    family: ClassVar[str] = "MuJoCo"
     adapter: ClassVar[type[SolverAdapter]] = SOLVERS["mujoco"]
     """Adapter of the solver."""
 
@@ -60,7 +61,7 @@ class NewtonBackend(WarpBackend):
             )
         if SOLVERS[solver] is cls.adapter:
             return cls
-        fields = {"name": f"newton:{solver}", "adapter": SOLVERS[solver]}
+        fields = {"name": f"newton:{solver}", "family": f"Newton {solver.capitalize()}", "adapter": SOLVERS[solver]}
         return type(f"{solver.capitalize()}NewtonBackend", (cls,), fields)
 
     def __init__(self, scene: Scene, *, device: str = "cpu", threads: int = 1) -> None:

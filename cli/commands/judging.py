@@ -1,4 +1,4 @@
-"""Commands that judge and study: evaluate, compare, verify, board, validate, consistency, trial, latent, replay."""
+"""Commands that judge and study: evaluate, compare, verify, board, validate, jury, consistency, trial, latent, replay."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import typer
 from ...files.choices import PLACE, WRITTEN, Choice
 from ...gauge.request import EvaluationOptions, Request
 from ...studies.consistency.request import StudyRequest
+from ...studies.jury.request import JuryRequest
 from ...studies.latent.request import LatentRequest
 from ...studies.reality.request import ReplayRequest
 from ...studies.trials.request import TrialRequest
@@ -21,6 +22,7 @@ app = typer.Typer()
 
 _CONTESTANTS = "Two or more of: policies, as for evaluate; results folders; results.json files and score cards."
 _ENGINES = "Engines, separated by commas; NAME@option=value changes a physics option (mujoco@timestep=0.005)."
+_JURY = "Engines, separated by commas. Default: one of each family that is installed, and MuJoCo with feet that turn freely."
 _COMPARED = "Folder of the comparison and its evaluations. Default: results/compare-<names>, and results/."
 _TABLES = "The measured table, then one for each simulator (CSV; docs/guides/validate.md)."
 _EXAMPLE = Choice("Tables that ship with the project: paper.", values=("paper",), flags=("--example",))
@@ -114,6 +116,25 @@ def validate(
     from ..validate import run_validation
 
     run_validation(tables, example_name=example_name, ranks_only=ranks_only, json_output=json_output)
+
+
+@command(app)
+def jury(
+    request: JuryRequest,
+    engines: Annotated[str, Choice(_JURY, PLACE, "backends")] = "",
+    out: Annotated[Path | None, output("results/<policies>-jury-<part>")] = None,
+    resume: Annotated[bool, resume("jury")] = False,
+    json_output: Tables = False,
+) -> None:
+    """Let engines of several families judge policies on the same episodes: scores, consensus, and who has learned its judge.
+
+    Examples:
+      gaitgauge jury pretrained
+      gaitgauge jury latest walk.onnx --engines mujoco,mujoco@foot_condim=3
+    """
+    from ..jury import run_jury
+
+    run_jury(request, engines, out=out, resume=resume, json_output=json_output)
 
 
 @command(app)

@@ -6,6 +6,7 @@ is what physics made of them.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass
@@ -19,6 +20,7 @@ from ...gauge.episodes import QUALITY, Episode, Record
 from ...gauge.goals import TARGET
 from ...gauge.plan import Records, plan_list
 from ...gauge.play.dispatcher import Dispatcher, Speculation, play
+from ...gauge.play.progress import ProgressMeter, Status
 from ...gauge.play.segments import count_segments
 from ...gauge.play.workers import Job, local_workers, start_workers
 from ...gauge.results import environment_weights
@@ -30,7 +32,7 @@ from .request import MARGIN
 from .statistics import Array, Estimate, effect_size, outcome_agreement, paired_mean
 from .variants import Variant
 
-_WORLDS = 24
+_WORLDS = 48
 """Worlds on the CPU."""
 _GPU_WORLDS = 8192
 """Worlds on a GPU, at most."""
@@ -88,7 +90,7 @@ def play_variant(
     records: dict[Episode, Record],
     keep: Callable[[Record], None],
     threads: int = 1,
-    watch: Callable[[int], None] = lambda _: None,
+    watch: Callable[[Status], None] = lambda _: None,
 ) -> None:
     """Play the episodes of which there is no record yet, as an evaluation plays those that its plans require.
 
@@ -96,7 +98,7 @@ def play_variant(
         records: episodes that have ended; those that end are added.
         keep: called with each record.
         threads: CPU threads; results do not depend on them.
-        watch: called now and then with the number of episodes that have ended.
+        watch: called now and then with how far playing is.
 
     Raises:
         BackendError: the engine cannot do what the episodes need.
@@ -117,10 +119,10 @@ def play_variant(
         build=variant.worlds,
         threads=max(threads // count, 1),
     )
-    plans = [partial(plan_list, episodes)]
+    plans, meter = [partial(plan_list, episodes)], ProgressMeter(suite, time.perf_counter())
 
     def on_progress(dispatcher: Dispatcher) -> None:
-        watch(len(episodes) - len(dispatcher.plans[0].required))
+        watch(meter.look(dispatcher.plans, dispatcher.active()))
 
     with closing(start_workers(job, count)) as workers:
         play(plans, records, keep, workers, speculation=Speculation(), watch=on_progress)

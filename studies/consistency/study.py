@@ -307,7 +307,7 @@ class _Policy:
                 records=store.records,
                 keep=store.put,
                 threads=cpu_threads(prepared.request.threads),
-                watch=lambda done: self._watch(status(done=done)),
+                watch=lambda found: self._watch(status(done=found.done)),
             )
         self._records[variant.label] = store.records
         return store.records

@@ -1,0 +1,82 @@
+"""Print what a jury of engines says of policies (``gaitgauge jury``)."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import typer
+from rich.text import Text
+
+from ..studies.jury.page import write_page
+from ..studies.jury.request import JuryRequest, JuryStatus
+from ..studies.jury.study import jury, prepare_jury
+from ..studies.jury.verdict import OFF, command_words
+from ..studies.naming import joined_names
+from .console import Terminal, make_table, print_json
+from .policies import policy_files
+from .progress import ProgressDisplay, duration
+from .studies import resumable
+
+
+def run_jury(request: JuryRequest, engines: str, *, out: Path | None, resume: bool, json_output: bool) -> None:
+    """Judge policies, show progress, print the tables and where the files are."""
+    folder = out or Path("results") / f"{joined_names(request.policies)}-jury-{request.part}"
+    names = tuple(name.strip() for name in engines.split(",") if name.strip())
+    request = replace(request, engines=names, policies=policy_files(request.policies))
+    console = Terminal(stderr=True)
+    prepared = prepare_jury(request)  # all that can be wrong with the request is said before anything is written
+    for engine in prepared.skipped:
+        console.say(f"{engine['engine']} does not judge: {engine['reason']}")
+    with resumable(console, "judging", folder, "--resume") as display:
+        command = ["gaitgauge", *sys.argv[1:]]
+        results = jury(prepared, folder, resume=resume, command=command, watch=lambda s: _show(display, s))
+    page = write_page(folder)
+    if json_output:
+        print_json(results)
+    else:
+        output = Terminal()
+        print_jury(output, results)
+        output.say(f"results  {folder / 'jury.json'}\npage     {page}")
+    unable = {engine["engine"]: engine["reason"] for block in results["policies"] for engine in block["unable"]}
+    for name, reason in unable.items():
+        console.say(f"{name} did not play to the end: {reason}")
+    if unable:
+        raise typer.Exit(1)
+
+
+def _show(display: ProgressDisplay, status: JuryStatus) -> None:
+    left = "estimating time" if status.seconds_left is None else f"about {duration(status.seconds_left)} left"
+    text = f"engine {status.number} of {status.count}, {status.engine}: {left}"
+    display.update(status.share, text, {"policy": status.policy})
+
+
+def print_jury(console: Terminal, results: Mapping[str, Any]) -> None:
+    """Print for each policy scores by engine, speeds by command, and the verdict."""
+    for block in results["policies"]:
+        label = block["policy"]["label"]
+        table = make_table(
+            f"{label}: scores by engine", "engine", "family", "score", "95 % interval", "falls", numbers=True
+        )
+        table.columns[1].justify = "left"
+        for name, engine in block["engines"].items():
+            low, high = engine["score"]["interval"]
+            score = f"{engine['score']['value']:.4f}"
+            falls = f"{engine['falls']}/{engine['segments']}" if engine["falls"] else ""
+            table.add_row(name, engine["family"], score, f"{low:.4f} to {high:.4f}", falls)
+        console.print(table)
+        table = make_table(f"{label}: share of the commanded speed", "command", *block["engines"], numbers=True)
+        for row in block["speeds"]:
+            cells = [
+                Text("fell", "red") if v is None else Text(f"{v:.2f}", "red" if abs(v - 1.0) > OFF else "")
+                for v in row["shares"].values()
+            ]
+            table.add_row(command_words(row), *cells)
+        console.print(table)
+        if block["training"]["note"]:
+            console.say(f"{label}: {block['training']['note']}")
+        for sentence in block["sentences"]:
+            console.say(sentence)
