@@ -198,7 +198,14 @@ def test_a_suite_may_limit_torque_by_speed(suite_file):
             "[metrics]\nweights = { dof_power = 1.0 }",
             "scoring.groups.tracking names 'ang_vel_err', which has no weight",
         ),
-        ("[metrics]\nweights = { dof_power = 0.0 }", "metrics.weights.dof_power is 0.0; it must be greater than 0"),
+        (
+            "[metrics]\nweights = { dof_power = -0.1 }",
+            "metrics.weights.dof_power is -0.1; it must be greater than or equal to 0",
+        ),
+        (
+            "[metrics]\nweights = { dof_power = 0.0 }",
+            "metrics.weights are all zero; give at least one metric a weight above 0",
+        ),
         ("[metrics]\nweights = {}", "metrics.weights is {}; .* at least 1 item"),
         (
             "[matrix]\nterrains = ['flat', 'flatt']",
