@@ -49,7 +49,7 @@ class _Own:
     packages: tuple[str, ...]
     note: str
     distributions: tuple[str, ...]
-    """What pip calls the engine itself, and what it needs under other terms."""
+    """Names of the engine's own package in pip, and of packages under other terms that it needs."""
     terms: str
     extra: str = ""
     """Extra of gaitgauge that installs the engine; empty where it always is."""

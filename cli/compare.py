@@ -42,7 +42,7 @@ def run_comparison(
 
 
 def print_comparison(console: Terminal, found: Mapping[str, Any]) -> None:
-    """A table of differences for each pair, then what is real in plain sentences."""
+    """Print a table of differences for each pair, then the real ones in sentences."""
     for first, second in dict.fromkeys((d["first"], d["second"]) for d in found["differences"]):
         columns = ("", "of", first, second, "difference", "95 % interval", "corrected p")
         table = make_table(f"{second} against {first}", *columns, numbers=True)

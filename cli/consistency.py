@@ -53,7 +53,7 @@ def _print_skipped(console: Terminal, skipped: Sequence[Mapping[str, str]]) -> N
 
 
 def print_study(console: Terminal, results: Mapping[str, Any]) -> None:
-    """Tables of every layer, the gap last, and which engines are missing from them."""
+    """Print tables of every layer, the gap last, and the engines that are missing from them."""
     for policy in results["policies"]:
         if len(results["policies"]) > 1:
             console.rule(policy["policy"])
@@ -185,7 +185,7 @@ def _unit(value: float | None, unit: str) -> str:
 
 
 def _small(value: float) -> str:
-    """Four decimals, or the power of ten of what they would hide."""
+    """Return a number with four decimals, or a smaller one with its power of ten."""
     return f"{value:.4f}" if value == 0.0 or abs(value) >= 1e-3 else f"{value:.1e}"
 
 

@@ -67,7 +67,7 @@ def run_sweep(asked: SweepRequest) -> None:
 
 
 def print_kept(console: Terminal, kept: Kept, of_all: str) -> None:
-    """What was kept and what could not be, and how much of ``of_all`` is there."""
+    """Print the runs that were kept, those that could not be, and how many of ``of_all`` are there."""
     for label, sentence in kept.unkept.items():
         console.say(f"{label} is not kept: {sentence}")
     to_gauge = f", {kept.to_gauge} of them not gauged yet" if kept.to_gauge else ""
@@ -75,7 +75,7 @@ def print_kept(console: Terminal, kept: Kept, of_all: str) -> None:
 
 
 def print_sweep(console: Terminal, found: Mapping[str, Any], folder: Path) -> None:
-    """A table of the entries, the comparison's sentences, and where the files are."""
+    """Print a table of the entries, the comparison's sentences, and the places of the files."""
     groups = list(dict.fromkeys(g for e in found["entries"] if e["best"] for g in e["best"]["groups"] or {}))
     several = any(e["range"] for e in found["entries"])
     columns = ("entry", "score", "95 % interval", *groups, "level", "seed", "mean of seeds", *["range"] * several)
