@@ -42,6 +42,7 @@ def run(program: str) -> str:
     return done.stdout
 
 
+@pytest.mark.slow
 def test_importing_an_engine_changes_nothing_in_other_projects():
     run(UNTOUCHED)
 

@@ -13,7 +13,7 @@ name = "tiny"
 title = "a second"
 goals = [{ name = "max_velocity", phases = [0.1, 0.04] }, { name = "target_pos_velocity", phases = [] }]
 [matrix]
-frictions = [0.6, 0.8]
+frictions = [0.6]
 [settling]
 longest = 0.1
 [scoring]
@@ -43,7 +43,7 @@ def test_two_settings_of_the_c_engine(run, refused, tmp_path, policy, tiny, monk
         "--terrain",
         "flat",
     )
-    command += ("--seeds", 2, "--factor", "timestep-5ms", "--out", out)
+    command += ("--seeds", 2, "--threads", 1, "--factor", "timestep-5ms", "--out", out)
     done = run(*command, "--json")
     assert done.exit_code == 0, done.output
     printed = json.loads(done.stdout)
@@ -75,7 +75,20 @@ def test_an_engine_that_is_left_out_is_told(run, tmp_path, policy, tiny, monkeyp
 
     monkeypatch.setattr(variants, "make_backend", make)
     engines = "mujoco,mujoco-warp,mujoco@timestep=0.005,mujoco@cone=pyramidal"
-    command = ("consistency", policy, "--backends", engines, "--suite", tiny, "--terrain", "flat", "--seeds", 2)
+    command = (
+        "consistency",
+        policy,
+        "--backends",
+        engines,
+        "--suite",
+        tiny,
+        "--terrain",
+        "flat",
+        "--seeds",
+        2,
+        "--threads",
+        1,
+    )
     done = run(*command, "--no-attribution", "--out", tmp_path / "study", *more)
     assert done.exit_code == 0, done.output
     assert "mujoco-warp is left out" in done.stderr

@@ -194,10 +194,12 @@ def test_a_folder_that_was_removed_is_one_sentence(tmp_path):
     assert done.stderr.endswith("gaitgauge: the current folder does not exist any more; change to another one\n")
 
 
-@pytest.mark.parametrize("arguments", ["list suites", "validate --example paper --json"])
-def test_a_reader_that_left_is_no_error(arguments):
+@pytest.mark.parametrize(
+    "program", [f"'{PROGRAM}' list suites", "'from gaitgauge.cli.console import print_json; print_json([1.0])'"]
+)
+def test_a_reader_that_left_is_no_error(program):
     # `exec <&-` closes the pipe before anything is written to it
-    command = f"set -o pipefail; {sys.executable} -c '{PROGRAM}' {arguments} | exec 0<&-"
+    command = f"set -o pipefail; {sys.executable} -c {program} | exec 0<&-"
     done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, timeout=120)
     assert (done.returncode, done.stderr) == (0, "")
 

@@ -67,6 +67,7 @@ def test_the_oldest_waiting_job_is_given_up_and_a_running_one_can_be_stopped(tmp
     assert time.monotonic() - start < 5.0 and side.pending == 0
 
 
+@pytest.mark.slow
 def test_a_gauge_that_cannot_play_says_why(tmp_path):
     """The gauge itself runs; the checkpoint is none."""
     (tmp_path / "model_3.pt").write_bytes(b"nothing of the kind")
