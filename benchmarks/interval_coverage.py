@@ -39,8 +39,8 @@ from gaitgauge.gauge.result import (
     SuiteName,
     TerrainScore,
 )
-from gaitgauge.gauge.results import environment_weights
 from gaitgauge.gauge.store import StoreError
+from gaitgauge.gauge.totals import environment_weights
 from gaitgauge.studies.compare.comparison import ComparisonError, compare
 from numpy.typing import NDArray
 

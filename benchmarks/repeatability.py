@@ -31,9 +31,9 @@ import numpy as np
 from gaitgauge.files.parsing import parse_json, read_text
 from gaitgauge.files.writing import json_text, write_atomically
 from gaitgauge.gauge.evaluate import Request, evaluate
-from gaitgauge.gauge.results import environment_weights
 from gaitgauge.gauge.store import StoreError
 from gaitgauge.gauge.suite import Suite, load_suite
+from gaitgauge.gauge.totals import environment_weights
 from gaitgauge.studies.policies import file_digest
 from scipy import stats
 

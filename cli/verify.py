@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -48,27 +48,43 @@ def _print_verification(console: Terminal, found: Mapping[str, Any], asked: Veri
         where = f"{item['terrain']}, friction {item['friction']:g}, payload {item['payload']:g} kg"
         console.say(f"{where}: level {item['card']} on the card, {item['here']} here")
     played, whole = found["environments"]
-    kind = ", one of each terrain" * asked.quick + ("" if asked.fresh is None else ", with other seeds")
-    console.say(f"played {played} of the card's {whole} environments{kind}")
+    other_seeds = "" if asked.fresh is None else " with other seeds"
+    if found["quick"]:
+        console.say(f"{played} of {whole} rows were played{other_seeds}, none of the others was checked")
+    else:
+        console.say(f"all {whole} rows were played{other_seeds}")
     if found["score"] is not None:
         band = "no interval" if found["band"] is None else "a replay within {:.4f} to {:.4f}".format(*found["band"])
-        console.say(f"score on the card {found['score']:.4f} ({band}), here {found['replayed']:.4f}")
+        of_rows = " of these rows" * found["quick"]
+        console.say(f"score{of_rows} on the card {found['score']:.4f} ({band}), here {found['replayed']:.4f}")
     for item in found["settings"]:
         console.say(f"{item['name']}: {shown(item['card'])} on the card, {shown(item['here'])} here")
     if found["unlike"]:
         console.say(f"card and replay were made with other versions: {'; '.join(found['unlike'])}")
     higher = found["band"] is not None and found["replayed"] > found["band"][1]
     if found["settings"]:
-        verdict = "does NOT hold: it was made with another solver or other motors"
+        verdict = "does NOT hold: it says of policy or physics what is not so here"
+    elif found["edited"]:
+        same, runs = found["runs"]
+        verdict = f"does NOT hold: {same} of {runs} runs are the same, but not all in {_listed(found['edited'])}"
     elif found["figures"]:
-        verdict = f"does NOT hold: every outcome is the same, but not its {', '.join(found['figures'])}"
+        verdict = f"does NOT hold: chance does not explain its {_listed(found['figures'])}"
+        if found["runs"][0] == found["runs"][1]:
+            verdict = f"does NOT hold: every outcome is the same, but not its {_listed(found['figures'])}"
     elif found["equal"]:
         verdict = "holds: every outcome is the same to the last digit"
     elif found["holds"]:
-        same = "the score lies within its band, single outcomes differ"
+        same = "score and figures lie within their bands, single outcomes differ"
         verdict = f"holds: {'with other seeds the score is higher still' if higher else same}"
     elif asked.fresh is not None:
         verdict = "does NOT hold with other seeds: its score owes something to those that everybody knows"
     else:
         verdict = "does NOT hold on this machine"
+    if found["quick"] and found["holds"]:
+        verdict = verdict.replace("holds:", "holds in these rows:")
     console.say(f"the card {verdict}")
+
+
+def _listed(names: Sequence[str]) -> str:
+    """Return a few names in words."""
+    return "; ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")

@@ -45,9 +45,10 @@ from .play.segments import count_segments
 from .play.workers import Job, local_workers, start_workers
 from .request import Request
 from .result import ClusterName, Motors, PolicyName, Provenance, Result
-from .results import fold, health, rows_csv
+from .results import fold, rows_csv
 from .store import RunFolder, StoreError
 from .suite import Suite, SuiteError, load_suite
+from .totals import health_of
 
 _WORLDS = 24
 """Worlds of a worker on the CPU: more worlds amortize the loop's overhead; fewer balance the load at the end."""
@@ -261,7 +262,7 @@ def evaluate(
             training=training_physics(contract),
             commands=command_shares(contract),
             feet=played_feet(suite, prepared.robot, engine),
-            health=health([record for outcome in outcomes for record in outcome.records]),
+            health=health_of(scores.environments),
             solver=dict(engine.solver_settings(suite.physics)),
             provenance=Provenance(
                 **provenance(

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .episodes import Record
-from .suite import Scoring
 
 Array = NDArray[np.float64]
 
@@ -58,6 +57,10 @@ class LevelWeights(Protocol):
     def quality_weight(self) -> float:
         """Of the quality."""
 
+    @property
+    def decimals(self) -> int | None:
+        """Decimals to which runs and means are rounded; None: not at all."""
+
 
 def level_score(value: Array | float, level: float, scoring: LevelWeights, *, flat: bool) -> Array | float:
     """Score of a quality (or metric) at a level: 0.09 (L - 1) + 0.19 q; the quality itself on flat ground; 0 at level 0.
@@ -71,11 +74,11 @@ def level_score(value: Array | float, level: float, scoring: LevelWeights, *, fl
     return scoring.level_weight * max(level - 1, 0) + scoring.quality_weight * min(level, 1) * value
 
 
-def rounded(value: Array, scoring: Scoring) -> Array:
+def rounded(value: Array, scoring: LevelWeights) -> Array:
     """Rounded as the suite says."""
     return value if scoring.decimals is None else np.round(value, scoring.decimals)
 
 
-def group_values(weighted: Mapping[str, float], scoring: Scoring) -> dict[str, float]:
+def group_values(weighted: Mapping[str, float], groups: Mapping[str, Sequence[str]]) -> dict[str, float]:
     """Mean of the level-weighted mean@50 of each group's metrics (paper, table of baselines)."""
-    return {g: float(np.mean([weighted[m] for m in names])) for g, names in scoring.groups.items()}
+    return {g: float(np.mean([weighted[m] for m in names])) for g, names in groups.items()}

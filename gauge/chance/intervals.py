@@ -69,11 +69,18 @@ class Chance:
         """Degrees of freedom of the standard error (Welch and Satterthwaite)."""
         return welch(*self._parts())
 
-    def interval(self, value: float, bounds: tuple[float, float] | None = (0.0, 1.0)) -> tuple[float, float] | None:
-        """Return Student's 95 % interval around a value, within the bounds of what it can be; None where one seed shows no spread."""
+    def interval(
+        self, value: float, bounds: tuple[float, float] | None = (0.0, 1.0), *, together: int = 1
+    ) -> tuple[float, float] | None:
+        """Return Student's 95 % interval around a value, within the bounds of what it can be; None where one seed shows no spread.
+
+        Args:
+            together: number of intervals that shall cover their values all at once with 95 % (Šidák 1967, which holds for
+                normal values whatever they have in common).
+        """
         if not self.known:
             return None
-        reach = float(special.stdtrit(self.freedom, 0.5 + 0.5 * CONFIDENCE)) * self.error
+        reach = float(special.stdtrit(self.freedom, 0.5 + 0.5 * CONFIDENCE ** (1.0 / together))) * self.error
         low, high = bounds or (-math.inf, math.inf)
         return max(value - reach, low), min(value + reach, high)
 
@@ -130,6 +137,7 @@ class Evidence:
             name: seeds the generator, so that the same rows have the same intervals; evaluations that are compared have two.
         """
         self.rows, self._rules = list(rows), rules
+        self._known: dict[tuple[str, ...], Array] = {}
         self._flat = np.array([r.flat for r in rows], dtype=bool)
         self._reached = np.array([r.reached for r in rows], dtype=np.float64)
         self._searched = np.array([bool(r.trials) for r in rows], dtype=bool)
@@ -168,7 +176,9 @@ class Evidence:
 
         Columns are metrics, ``quality`` or names of sub-commands, whose column is their quality.
         """
-        values = np.zeros((len(self.rows), len(self._rules.seeds)))
+        if (known := self._known.get(tuple(columns))) is not None:
+            return known
+        values = self._known[tuple(columns)] = np.zeros((len(self.rows), len(self._rules.seeds)))
         for at in np.flatnonzero(self._played).tolist():
             for place, seed in enumerate(self._rules.seeds):
                 run = self.rows[at].runs[seed]
@@ -184,10 +194,12 @@ class Evidence:
             columns: see ``runs``.
         """
         rules, means = self._rules, self._supposed(self.runs(columns).mean(1))[:, None]
+        levels, at = np.zeros_like(self.redrawn), np.flatnonzero(~self._flat & (weights != 0.0))
+        redrawn, means = self.redrawn[at], means[at]
         if QUALITY in columns:
-            away = np.where(self._reached > 0, self.redrawn.T - self._reached, 0).T
+            away = np.where(self._reached[at] > 0, redrawn.T - self._reached[at], 0).T
             means = np.minimum(means * _QUALITY_STEP**away, 1.0)
-        levels = weights[:, None] * np.where(self._flat[:, None], 0.0, self._at_levels(self.redrawn, means))
+        levels[at] = weights[at, None] * self._at_levels(redrawn, means)
         share = rules.quality_weight * np.minimum(self._reached, 1.0)
         at_reached = self.chance_at_levels(weights * np.where(self._flat, 1.0, share), columns)
         return replace(at_reached, **self._of_levels(levels), seeds=(*at_reached.seeds, self._search_seeds(weights)))

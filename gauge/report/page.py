@@ -13,6 +13,7 @@ from ..coverage import notes, score_label, suite_label
 from ..episodes import QUALITY
 from ..metrics import metric_label
 from ..result import EnvironmentRow, Health, MetricScore, Result, TerrainScore
+from ..result_figures import check_figures
 from ..scoring import STATISTICS
 from ..store import StoreError
 from . import charts
@@ -49,7 +50,10 @@ def write_report(folder: Path) -> Path:
     file, clip = folder / "results.json", _clip(folder)
 
     def page(data: Mapping[str, Any]) -> str:
-        return render(Result.from_data(data, f"{file} was edited or is damaged", StoreError), clip)
+        source = f"{file} was edited or is damaged"
+        result = Result.from_data(data, source, StoreError)
+        check_figures(result, source, StoreError)
+        return render(result, clip)
 
     return page_of(file, "report.html", page, command="evaluate")
 

@@ -11,9 +11,11 @@ import jinja2
 
 from ...files.parsing import edited, one_line
 from ...files.writing import make_folder, write_atomically
+from ...gauge.chance.intervals import Evidence
 from ...gauge.report.pages import page_template
 from ...gauge.result import Result
 from ...gauge.suite import load_suite, suite_names
+from ...gauge.totals import environment_weights
 from ...policy.contract import PRIVILEGED_TERMS
 from ...policy.finding import shipped_policies
 from ..compare.comparison import load_result
@@ -60,7 +62,8 @@ def board_data(cards: Mapping[str, Result], folder: Path = Path()) -> list[dict[
     Returns:
         For each table ``suite``, ``backend``, ``robot``, ``robot_digest`` (None where cards do not say), ``ranked`` (complete
         cards, best first, with their ``rank``) and ``others`` (parts, custom runs, levels alone and policies with privileged
-        observations, which have no rank).
+        observations, which have no rank). Intervals of ranked cards cover all their scores at once with 95 %, the first one's
+        included, which is first by luck as well; ``ranks`` are the ranks that they leave possible.
     """
     tables: dict[tuple[str, str, str, str, str, str | None], dict[str, Result]] = {}
     for name, card in cards.items():
@@ -76,6 +79,9 @@ def board_data(cards: Mapping[str, Result], folder: Path = Path()) -> list[dict[
         ranked = [e for e in entries if e["ranked"]]
         for entry in ranked:  # equal scores share a rank
             entry["rank"] = 1 + sum(other["score"] > entry["score"] for other in ranked)
+            entry["interval"] = _interval(rows[entry["card"]], len(ranked))
+        for entry in ranked:
+            entry["ranks"] = _possible_ranks(entry, ranked)
         others = [e for e in entries if not e["ranked"]]
         digest, called, version, backend, robot, files = key
         place = {
@@ -91,6 +97,21 @@ def board_data(cards: Mapping[str, Result], folder: Path = Path()) -> list[dict[
 def render_board(tables: Sequence[Mapping[str, Any]]) -> str:
     """Return the page, as HTML text. The texts of cards are shown as text and never becomes markup."""
     return page_template(__file__, "board.html.j2").render(tables=tables)
+
+
+def _interval(card: Result, together: int) -> tuple[float, float] | None:
+    """Return the interval of a score that covers it together with those of the other cards of its table."""
+    if card.score is None or not card.environments:
+        return card.score_interval
+    weights = environment_weights([row.terrain for row in card.environments])
+    return Evidence(card.environments, card.chance).chance(weights).interval(card.score, together=together)
+
+
+def _possible_ranks(entry: Mapping[str, Any], ranked: Sequence[Mapping[str, Any]]) -> tuple[int, int]:
+    """Return the best and the worst rank that a card may have in truth: intervals that do not meet are told apart."""
+    low, high = entry["interval"] or (0.0, 1.0)
+    known = [other["interval"] or (0.0, 1.0) for other in ranked if other is not entry]
+    return 1 + sum(other[0] > high for other in known), len(ranked) - sum(other[1] < low for other in known)
 
 
 def _entry(name: str, card: Result, folder: Path, policy: str) -> dict[str, Any]:
@@ -113,5 +134,6 @@ def _entry(name: str, card: Result, folder: Path, policy: str) -> dict[str, Any]
         "proved": card.proved,
         "ranked": card.complete and card.score is not None and not privileged,
         "rank": None,
+        "ranks": None,
         "command": f"gaitgauge verify {shlex.quote(str(folder / name))}{'' if found else ' --policy FILE'}",
     }

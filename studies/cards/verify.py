@@ -4,42 +4,49 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from ...backends.base import BackendError
+from ...backends.registry import backend_class
 from ...files.parsing import edited, one_line, shown
 from ...gauge.chance.intervals import Evidence
 from ...gauge.coverage import coverage
+from ...gauge.episodes import QUALITY
 from ...gauge.evaluate import Prepared, Request, Status, evaluate, prepare
+from ...gauge.goals import TARGET, command_name, count_sub_commands
 from ...gauge.pipelines import Environment
-from ...gauge.result import BY_HAND, UNKNOWN, EnvironmentRow, Result, Table, unlike
-from ...gauge.result_figures import check_interval
-from ...gauge.results import chance_rules, environment_weights
+from ...gauge.result import BY_HAND, UNKNOWN, Coverage, EnvironmentRow, Result, Run, Table, unlike
+from ...gauge.results import chance_rules
 from ...gauge.suite import Suite, load_suite
+from ...gauge.totals import environment_weights
 from ...policy.finding import shipped_policies
+from ...policy.robot_of import REMEMBERED
 from ...robots import robot_names
 from ...robots.loading import robot_digest
 from ..policies import file_digest
+from .agreement import figures_that_are_off
 
 _APART = 1_000_000
 """Distance of fresh seeds from those of the next number."""
-_OUTCOME = ("level", "score", "quality", "metrics", "trials", "runs", "falls", "diverged", "overflowed", "restarted")
-"""Entries of an environment's row that must be the same to the last digit for a replay to be called equal."""
-_FIGURES = (
+_SAME = 1e-5
+"""Differences of a figure up to this are rounding."""
+_SCORES = (
     "score",
-    "score_interval",
     "level",
-    "level_interval",
     "terrains",
     "metrics",
     "groups",
-    "groups_interval",
     "health",
+    *("score_interval", "level_interval", "groups_interval"),
 )
-"""Figures that must be the same as well, where all environments are replayed."""
+"""Figures over all environments."""
+_OF_THE_PLACE = ("imported_from", REMEMBERED)
+"""Entries of a policy's provenance that a copy of it may have otherwise."""
 
 
 class CardError(ValueError):
@@ -155,7 +162,33 @@ def check_card(card: Result, suite: Suite | None, source: str) -> None:
             raise CardError(
                 f"{source} calls itself {one_line(stated)}, but holds {one_line(held.text)} of {suite.name}; {BY_HAND}"
             )
-    check_interval(card, source, CardError)
+        if card.proved:
+            _check_suite_s(card, suite, held, source)
+
+
+def _check_suite_s(card: Result, suite: Suite, held: Coverage, source: str) -> None:
+    """Check that coverage, columns, groups, sub-commands and solver are those of the suite; raise ``CardError`` where they are not."""
+    run = next((run for row in card.environments for run in row.runs.values()), None)
+    goals = [goal.name for goal in suite.goals if goal.name != TARGET]
+    commands = {command_name(goal, part) for goal in goals for part in range(count_sub_commands(suite, goal))}
+    pairs: dict[str, tuple[Any, Any]] = {
+        "suite.title": (card.suite.title, suite.title),
+        "coverage": (card.coverage.to_data(), held.to_data()),
+        "group_metrics": (
+            {g: list(m) for g, m in card.group_metrics.items()},
+            {g: list(m) for g, m in suite.scoring.groups.items()},
+        ),
+    }
+    if run is not None:
+        pairs["the list of metrics"] = (sorted(run.columns), sorted([*suite.metrics.weights, QUALITY]))
+        pairs["the list of sub-commands"] = (sorted(run.commands), sorted(commands))
+    with suppress(BackendError):  # an engine that is not here is asked by whoever replays the card
+        pairs["solver"] = (dict(card.solver), dict(backend_class(card.backend).solver_settings(suite.physics)))
+    for name, (stated, expected) in pairs.items():
+        if stated != expected:
+            raise CardError(
+                f"{source}: {name} is {shown(stated)}, but that of {suite.name} is {shown(expected)}; {BY_HAND}"
+            )
 
 
 def with_fresh_seeds(prepared: Prepared, number: int) -> Prepared:
@@ -201,31 +234,41 @@ def verify(
 def judge(card: Result, replay: Result, *, fresh: bool = False) -> dict[str, Any]:
     """Judge whether a card holds, given the result of a replay of all or some of its environments.
 
-    It holds where the replay's score lies within a band around the card's (``tolerance_band``), whose width is that of the replay's
-    interval: what the card says of its own does not count. Where the replay has none (one seed, or levels alone) only the same
-    outcome holds. Where all outcomes are the same, so must be the figures made of them; solver and motors must be in any case.
+    Where all outcomes are the same, all figures made of them must be. Where most runs differ, as on a processor of another kind,
+    the replay's score must lie within a band around the card's (``tolerance_band``), whose width is that of the replay's interval,
+    and every other figure within what chance explains (``agreement``). Where most runs are the same and some are not, those were
+    edited. Where the replay has no interval (one seed, or levels alone) only the same outcome holds. Solver, motors, feet and
+    all that is said of the policy must be the same in any case.
 
     Args:
-        fresh: whether the replay had other seeds than the card. Then a score above the band holds as well: it owes nothing to
-            the card's seeds.
+        fresh: whether the replay had other seeds than the card. Then a score or figure above the band holds as well: it owes
+            nothing to the card's seeds.
 
     Returns:
-        ``holds``, ``equal`` (every outcome, and every figure made of them, the same to the last digit), ``quick``, ``environments``
-        (played, of the card), ``score``, ``interval`` and ``band`` of the card and the ``replayed`` score over what was played;
-        ``levels``: for each environment whose level differs its terrain, friction, payload, ``card`` and ``here``; ``figures``:
-        names of those that are off though all outcomes are the same; ``settings``: ``name``, ``card`` and ``here`` of each of the
-        solver or the motors that differs; ``unlike``: versions that differ, in words.
+        ``holds``, ``equal`` (every outcome, and every figure made of them, the same to rounding), ``quick``, ``environments``
+        (played, of the card), ``runs`` (the same, of those played), ``score``, ``interval`` and ``band`` of the card and the
+        ``replayed`` score over what was played; ``levels``: for each environment whose level differs its terrain, friction,
+        payload, ``card`` and ``here``; ``figures``: names of those that are off; ``edited``: environments that differ though
+        most are the same; ``settings``: ``name``, ``card`` and ``here`` of what was not played alike; ``unlike``: versions that
+        differ, in words.
     """
     by_key = {row.key: row for row in card.environments}
     pairs = [(by_key[row.key], row) for row in replay.environments]
-    same = all(getattr(old, name) == getattr(new, name) for old, new in pairs for name in _OUTCOME)
-    quick = len(pairs) < len(by_key)
-    whole = same and not quick and not fresh
-    stated = card.entries()
-    figures = [name for name in _FIGURES if whole and _says_other(stated.get(name), getattr(replay, name))]
+    quick, stated = len(pairs) < len(by_key), card.entries()
+    tables = [(old, old.entries(), new.entries()) for old, new in pairs]
+    same = not any(_differs(stated_here, found, by=0.0) for _, stated_here, found in tables)
+    other = [row for row, stated_here, found in tables if _differs(stated_here, found, by=_SAME)]
+    runs, same_runs = _count_runs(pairs)
+    figures, whole = [], not other and not quick and not fresh
+    if other:
+        figures = figures_that_are_off(pairs, replay.chance, flattering=fresh)
+    elif whole:
+        figures = [name for name in _SCORES if name in stated and _says_other(stated[name], getattr(replay, name))]
     equal = same and not (
-        whole and any(_says_other(stated.get(name), getattr(replay, name), by=0.0) for name in _FIGURES)
+        whole and any(_says_other(stated.get(name), getattr(replay, name), by=0.0) for name in _SCORES)
     )
+    # a processor of another kind changes nearly all runs where the robot moves
+    edited = [] if fresh or 2 * same_runs <= runs else [_place(row) for row in other]
     score, interval, here = card.score, None, replay.score
     if score is not None:
         weights = environment_weights([old.terrain for old, _ in pairs])
@@ -236,15 +279,16 @@ def judge(card: Result, replay: Result, *, fresh: bool = False) -> dict[str, Any
     within = band is not None and here is not None and band[0] <= here and (fresh or here <= band[1])
     asked, used = _settings(card), _settings(replay)
     settings = [
-        {"name": name, "card": value, "here": used[name]}
-        for name, value in asked.items()
-        if name in used and value != used[name]
+        {"name": name, "card": asked.get(name), "here": used.get(name)}
+        for name in ({**asked, **used} if card.proved else asked)
+        if asked.get(name) != used.get(name)
     ]
     return {
-        "holds": not settings and (not figures if same else within),
+        "holds": not settings and not figures and not edited and (same or within),
         "equal": equal,
         "quick": quick,
         "environments": [len(pairs), len(by_key)],
+        "runs": [same_runs, runs],
         "score": score,
         "interval": None if interval is None else [round(float(end), 6) for end in interval],
         "band": band,
@@ -255,28 +299,61 @@ def judge(card: Result, replay: Result, *, fresh: bool = False) -> dict[str, Any
             if old.level != new.level
         ],
         "figures": figures,
+        "edited": edited,
         "settings": settings,
         "unlike": unlike([card.versions, replay.versions]),
     }
 
 
+def _place(row: EnvironmentRow) -> str:
+    return f"{row.terrain}, friction {row.friction:g}, payload {row.payload:g} kg"
+
+
+def _differs(stated: Mapping[str, Any], found: Mapping[str, Any], *, by: float) -> bool:
+    """Return whether a row states anything that is off by more than so much; its interval follows from the rest."""
+    return any(_says_other(value, found.get(name), by=by) for name, value in stated.items() if name != "interval")
+
+
+def _count_runs(pairs: Sequence[tuple[EnvironmentRow, EnvironmentRow]]) -> tuple[int, int]:
+    """Return the number of runs that the card has, and of those that are the same here."""
+    runs = [(old, new.runs.get(seed)) for row, new in pairs for seed, old in row.runs.items()]
+    return len(runs), sum(new is not None and not _says_other(old, new, by=_SAME) for old, new in runs)
+
+
 def _says_other(stated: Any, found: Any, *, by: float = 1e-4) -> bool:
     """Return whether a figure, or one in a table or pair of them, is off by more than so much; one that is not stated is not."""
+    if isinstance(stated, Run) and stated.health is None:  # schema 2
+        return _says_other((stated.columns, stated.commands), (found.columns, found.commands), by=by)
     if isinstance(stated, Table):
         return any(_says_other(value, getattr(found, name), by=by) for name, value in stated.entries().items())
     if isinstance(stated, Mapping):
-        return any(_says_other(value, (found or {}).get(key), by=by) for key, value in stated.items())
+        return stated.keys() != (found or {}).keys() or any(
+            _says_other(value, found[key], by=by) for key, value in stated.items()
+        )
     if isinstance(stated, tuple):
         return len(stated) != len(found or ()) or any(
             _says_other(a, b, by=by) for a, b in zip(stated, found, strict=True)
         )
-    return stated is not None and (found is None or abs(stated - found) > by)
+    if isinstance(stated, float | int) and isinstance(found, float | int):
+        return abs(stated - found) > by
+    return stated is not None and stated != found
 
 
 def _settings(result: Result) -> dict[str, Any]:
-    """Return settings of solver and motors, as far as the result states them."""
-    gains = {"motors.stiffness": list(result.motors.stiffness), "motors.damping": list(result.motors.damping)}
-    return {f"solver.{name}": value for name, value in result.solver.items()} | {n: g for n, g in gains.items() if g}
+    """Return what was played, with what and by which policy, as far as the result states it, as plain data by name."""
+    policy = result.policy.to_data()
+    found: dict[str, Any] = {}
+    for name in ("motors", "feet", "commands", "training"):
+        if name not in result.lacking:
+            found |= {f"{name}.{key}": value for key, value in getattr(result, name).to_data().items() if value != []}
+    found |= {f"solver.{name}": value for name, value in result.solver.items()}
+    found |= {
+        f"policy.{name}": policy[name]
+        for name in ("contract_hash", "kind_of_observations", "assumptions")
+        if name in policy
+    }
+    origin = {f"policy.provenance.{k}": v for k, v in result.policy.provenance.items() if k not in _OF_THE_PLACE}
+    return found | origin | {"robot": result.robot, "backend": result.backend}
 
 
 def tolerance_band(score: float | None, interval: Sequence[float] | None) -> list[float] | None:

@@ -5,7 +5,6 @@ A result is enough: its rows hold every trial and run. Policies that were given 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -18,9 +17,9 @@ import numpy as np
 from ...files.parsing import edited, one_line, shown
 from ...gauge.chance.intervals import Array, Chance, Evidence
 from ...gauge.episodes import QUALITY
-from ...gauge.result import CONFIDENCE, Coverage, EnvironmentRow, Interval, Result, Runs, SuiteName, read_result, unlike
+from ...gauge.result import CONFIDENCE, Coverage, EnvironmentRow, Interval, Result, SuiteName, read_result, unlike
 from ...gauge.result_figures import BY_HAND, check_figures
-from ...gauge.results import ONE_SEED, environment_weights
+from ...gauge.totals import ONE_SEED, environment_weights, runs_at
 from ..naming import distinct_names
 
 KINDS = ("score", "level", "group", "terrain", "friction", "payload", "metric", "command")
@@ -227,15 +226,18 @@ def holm(p_values: Sequence[float]) -> list[float]:
     return found.tolist()
 
 
-def load_result(path: Path) -> Result:
-    """Read a results folder, its ``results.json``, or a copy of that, and check that its figures follow from its runs.
+def load_result(path: Path, *, intervals: bool = True) -> Result:
+    """Read a results folder, its ``results.json``, or a copy of that, and check that its figures follow from its trials and runs.
+
+    Args:
+        intervals: False leaves intervals unchecked, which take a second or two of a whole suite.
 
     Raises:
         ComparisonError: there is none, or it is damaged, edited, or too old to compare.
     """
     found = read_result(path, ComparisonError)
     file = path / "results.json" if path.is_dir() else path
-    check_figures(found, f"results '{one_line(file)}'", ComparisonError)
+    check_figures(found, f"results '{one_line(file)}'", ComparisonError, intervals=intervals)
     return found
 
 
@@ -359,16 +361,11 @@ def _at_same_levels(first: Evidence, second: Evidence) -> dict[Evidence, Evidenc
     """Return the runs of two evaluations at levels that both were measured at, the lowest one of each environment; no runs elsewhere."""
     found: tuple[list[EnvironmentRow], list[EnvironmentRow]] = ([], [])
     for one, other in zip(first.rows, second.rows, strict=True):
-        tables = (_runs_by_level(one), _runs_by_level(other))
+        tables = (runs_at(one), runs_at(other))
         common = sorted(tables[0].keys() & tables[1].keys())
         for rows, row, table in zip(found, (one, other), tables, strict=True):
             rows.append(replace(row, trials={}, runs=table[common[0]] if common else {}))
     return {first: first.of(found[0]), second: second.of(found[1])}
-
-
-def _runs_by_level(row: EnvironmentRow) -> Mapping[int, Runs]:
-    """Return the runs of an environment by the level at which they were played, 0 on flat ground."""
-    return (row.runs_by_level or {math.ceil(row.reached): row.runs}) if row.runs else {}
 
 
 def _score(weights: Array, columns: Sequence[str], evidence: Evidence) -> tuple[float, Chance]:

@@ -23,9 +23,9 @@ from ...gauge.play.dispatcher import Dispatcher, Speculation, play
 from ...gauge.play.progress import ProgressMeter, Status
 from ...gauge.play.segments import count_segments
 from ...gauge.play.workers import Job, local_workers, start_workers
-from ...gauge.results import environment_weights
 from ...gauge.scoring import run_statistics
 from ...gauge.suite import Suite
+from ...gauge.totals import environment_weights
 from ...policy.base import Policy
 from ...robots import Robot
 from .request import MARGIN

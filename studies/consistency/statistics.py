@@ -17,7 +17,7 @@ from scipy import stats
 
 from ...gauge.chance.intervals import welch, wilson_interval
 from ...gauge.result import CONFIDENCE
-from ...gauge.results import environment_weights
+from ...gauge.totals import environment_weights
 
 Array = NDArray[np.float64]
 

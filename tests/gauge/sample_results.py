@@ -7,14 +7,25 @@ from functools import cache
 from html.parser import HTMLParser
 
 import numpy as np
+from gaitgauge.backends.base import PhysicsBackend
 from gaitgauge.gauge.coverage import coverage
 from gaitgauge.gauge.episodes import Record
 from gaitgauge.gauge.pipelines import make_environments
 from gaitgauge.gauge.plan import PlanRules, environment_result, plan
-from gaitgauge.gauge.result import EnvironmentRow, PolicyName, Provenance, Result
-from gaitgauge.gauge.results import fold, health
+from gaitgauge.gauge.result import (
+    CommandShares,
+    EnvironmentRow,
+    Feet,
+    Motors,
+    PolicyName,
+    Provenance,
+    Result,
+    TrainingPhysics,
+)
+from gaitgauge.gauge.results import fold
 from gaitgauge.gauge.store import StoreError
 from gaitgauge.gauge.suite import load_suite
+from gaitgauge.gauge.totals import health_of, totals, whole_row
 
 HOSTILE = 'a/<img src="http://evil.example/x.png" onerror=alert(1)></script><script>alert(2)</script>&"\'.pt'
 
@@ -56,10 +67,10 @@ def read(data, error=StoreError):
 
 
 @cache
-def _sample(pipeline, suite, resamples, reach=None, **choices):
+def _sample(pipeline, suite, resamples, reach=None, seed=0, **choices):
     suite = load_suite(suite)
     suite = replace(suite, scoring=replace(suite.scoring, bootstrap=resamples))
-    generator = np.random.default_rng(0)
+    generator = np.random.default_rng(seed)
     chosen = {"terrains": suite.matrix.terrains, "frictions": None, "payloads": None, "level": None, **choices}
     rules = PlanRules(suite=suite, seeds=suite.matrix.seeds, quality=pipeline != "level")
     environments = []
@@ -78,13 +89,21 @@ def _sample(pipeline, suite, resamples, reach=None, **choices):
             path="policies/go2_cts.pt",
             contract_hash="ab" * 32,
             file_sha256="cd" * 32,
+            observations=("base_angular_velocity_b", "command", "joint_position"),
+            kind_of_observations="measurable",
             provenance={"adapter": "TorchScript", "steps": 5},
         ),
         pipeline=pipeline,
         backend="mujoco",
         robot="go2",
-        health=health([r for e in environments for r in e.records]),
+        motors=Motors(stiffness=(20.0,) * 12, damping=(0.5,) * 12),
+        training=TrainingPhysics(note="unknown"),
+        commands=CommandShares(limits=(2.0, 1.0, 2.0)),
+        feet=Feet(dimension=(6,), torsion=0.02),
+        solver=PhysicsBackend.solver_settings(suite.physics),
+        health=health_of(scores.environments),
         provenance=Provenance(
+            digests={"policy": "cd" * 32, "robot": "ef" * 32, "suite": suite.digest, "source": "12" * 32},
             versions={"python": "3.11.2", "gaitgauge": "0.1.0", "mujoco": "3.17.0", "torch": "2.13.0"},
             command="gaitgauge evaluate policies/go2_cts.pt --suite robogauge-1.1",
             date="2026-01-02T03:04:05+00:00",
@@ -96,6 +115,19 @@ def _sample(pipeline, suite, resamples, reach=None, **choices):
             physics_steps=1_234_567,
         ),
     )
+
+
+def made_of(result, rows):
+    """Return a result whose figures were all made anew of other rows, as a forger with the program would."""
+    scores = totals(
+        [whole_row(row, result.chance) for row in rows],
+        result.chance,
+        suite=result.suite,
+        groups=result.group_metrics,
+        metrics=list(result.metrics),
+        evaluated=result.score is not None,
+    )
+    return replace(result, **vars(scores) | {"health": health_of(scores.environments), "lacking": frozenset()})
 
 
 PIPELINES = {

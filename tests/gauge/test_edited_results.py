@@ -12,7 +12,7 @@ import pytest
 from gaitgauge.api import ArgumentError, ResultsError, evaluate, load_policy, load_results, train
 from gaitgauge.api import compare as compare_results
 from gaitgauge.backends.base import BackendError
-from gaitgauge.gauge.result import MOST_ROWS
+from gaitgauge.gauge.result import MOST_ROWS, read_result
 from gaitgauge.gauge.store import StoreError
 from gaitgauge.gauge.suite import SuiteError
 from gaitgauge.policy.base import PolicyError
@@ -76,7 +76,11 @@ def test_an_expected_level_is_no_edited_one():
         (("chance",), None, "chance is None"),
         (("chance", "note"), 3, "chance: note is 3"),
         (("environments",), TRUE["environments"] * 2, "is there twice"),
-        (("environments", 0, "score"), None, r"environments\[0\] has no score"),
+        (
+            ("environments", 0, "score"),
+            None,
+            r"environments\[0\].score is nothing, but what it is made of gives 0.17750",
+        ),
         (("environments", 0, "runs"), 5, "runs is 5"),
         (("environments", 0, "runs"), {"x": {}}, "'x'; it must be a whole number"),
         (("environments", 0, "runs"), {"0": {"quality": "high"}}, "runs.0.quality is 'high'"),
@@ -135,9 +139,9 @@ def test_rules_of_chance_that_are_none_or_would_take_all_memory(edited, key, val
         (
             ("environments", 0, "runs"),
             {},
-            r"environments\[0\].quality.mean50 is .*, but what it is made of gives nothing",
+            r"environments\[0\].quality is there, but what it is made of gives nothing",
         ),
-        (("environments", 1, "trials"), {}, r"environments\[1\].trials lacks levels that environments\[1\].search has"),
+        (("environments", 1, "trials"), {}, r"environments\[1\].trials lacks .* its search has: level 2, seed 100"),
         (("chance", "seeds"), [0, 1, 2], r"environments\[0\].runs has the seeds '.*', but chance.seeds has '0, 1, 2'"),
     ],
 )
@@ -164,9 +168,17 @@ def test_a_score_that_does_not_follow_from_level_and_quality_is_named(edited):
 def test_many_rows_with_many_replicates_are_too_many(edited):
     rows = [TRUE["environments"][0] | {"payload": 0.01 * at} for at in range(1000)]
     file = edited("environments", value=rows)
-    summary = {"score": rows[0]["score"], "level": None, "terrains": {}, "metrics": {}, "groups": {}, "health": None}
+    summary = {
+        "score": rows[0]["score"],
+        "level": None,
+        "terrains": {},
+        "metrics": {},
+        "groups": {},
+        "group_metrics": {},
+    }
+    summary |= {"health": None, "score_interval": None, "groups_interval": {}}
     file.write_text(json.dumps(json.loads(file.read_text()) | summary))
-    many = load_result(file)
+    many = read_result(file, ComparisonError)
     many = replace(many, chance=replace(many.chance, resamples=100_000))
     with pytest.raises(ComparisonError, match="1000 environments with 100,000 replicates"):
         compare([many, replace(many, policy=replace(many.policy, path="other.pt"))], ["one", "two"])

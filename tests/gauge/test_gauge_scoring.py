@@ -136,7 +136,7 @@ BASELINES = {
 @pytest.mark.parametrize("model", BASELINES)
 def test_groups_are_the_papers(model):
     weighted, published = BASELINES[model]
-    groups = group_values(dict(zip(COLUMNS, weighted, strict=True)), OWN.scoring)
+    groups = group_values(dict(zip(COLUMNS, weighted, strict=True)), OWN.scoring.groups)
     assert list(groups) == ["tracking", "safety", "quality"]
     assert list(groups.values()) == pytest.approx(published, abs=0.51e-4 + 1e-9)
 

@@ -2,17 +2,15 @@
 
 import json
 
-import numpy as np
 import pytest
 from gaitgauge.cli.main import app
 from gaitgauge.gauge.coverage import UNPROVED, notes
-from gaitgauge.gauge.results import environment_weights
 from gaitgauge.gauge.suite import load_suite
 from gaitgauge.studies.cards.board import board_data, render_board, write_board
 from gaitgauge.studies.cards.verify import CardError
 from gaitgauge.studies.compare.comparison import ComparisonError
 from gaitgauge.studies.policies import file_digest
-from sample_results import HOSTILE, Page, read, sample
+from sample_results import HOSTILE, Page, made_of, read, sample
 from typer.testing import CliRunner
 
 CHANCE = sample().chance.to_data()
@@ -154,13 +152,10 @@ def whole(tmp_path):
 def test_a_card_that_holds_less_than_it_says_is_not_put_on_the_board(whole):
     """The page's folder is created."""
     assert "robogauge-1.1 1.1.0" in Page(whole().read_text()).text
-    content = whole.content
-    rows = [row for row in content["environments"] if row["friction"] != 0.2]
-    weights = environment_weights([row["terrain"] for row in rows])
-    part = {"environments": rows, "score": float(weights @ [row["score"] for row in rows])}
-    part |= {"level": float(np.mean([row["level"] for row in rows if row["terrain"] != "flat"]))}
+    rows = [row for row in read(whole.content).environments if row.friction != 0.2]
+    part = made_of(read(whole.content), rows).to_data()
     with pytest.raises(CardError, match=r"card\.json' calls itself complete, but holds 8 of 9 frictions"):
-        whole(**part, schema=2, terrains={}, metrics={}, groups={}, health=None)
+        whole(**part)
 
 
 @pytest.mark.parametrize(
@@ -180,7 +175,9 @@ def test_a_card_that_holds_less_than_it_says_is_not_put_on_the_board(whole):
 def test_a_card_that_names_another_suite_than_its_own_is_not_put_on_the_board(whole, change, named):
     """Renamed, it was not checked, and headed the table of a suite that it does not hold."""
     with pytest.raises(CardError, match=named):
-        whole(suite=whole.content["suite"] | change)
+        suite, found = whole.content["suite"] | change, whole.content["provenance"]
+        digests = found["digests"] | {"suite": suite["digest"]}
+        whole(suite=suite, provenance=found | {"digests": digests})
 
 
 def test_suites_of_the_same_digest_and_other_names_have_tables_of_their_own():

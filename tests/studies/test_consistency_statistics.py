@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from gaitgauge.gauge.results import environment_weights
+from gaitgauge.gauge.totals import environment_weights
 from gaitgauge.studies.consistency.statistics import (
     DIFFERENT,
     EQUIVALENT,

@@ -5,12 +5,13 @@ from pathlib import Path
 
 import pytest
 from gaitgauge.gauge.evaluate import Request, identity, prepare
-from gaitgauge.gauge.result import Coverage, Motors
+from gaitgauge.gauge.result import Motors
+from gaitgauge.gauge.result_figures import check_figures
 from gaitgauge.gauge.suite import load_suite
 from gaitgauge.studies.cards.verify import CardError, check_card, judge, prepare_replay, with_fresh_seeds
 from gaitgauge.studies.compare.comparison import ComparisonError, load_result
 from gaitgauge.studies.policies import file_digest
-from sample_results import sample
+from sample_results import made_of, sample
 
 
 @pytest.fixture
@@ -31,16 +32,58 @@ def test_the_same_outcomes_hold_and_are_equal(card):
     assert found["interval"] == list(card.score_interval)
 
 
+def shifted(result, by, rows=None):
+    """Return a result as another kind of processor would find it: every run differs, its quality by so much more or less."""
+
+    def moved(run, at):
+        change = by + 2e-4 * (-1) ** at
+        tables = ({**table, "quality": table["quality"] + change} for table in (run.columns, run.mean, run.mean25))
+        columns, mean, mean25 = tables
+        return replace(run, columns=columns, mean=mean, mean25=mean25)
+
+    chosen = range(len(result.environments)) if rows is None else rows
+    return made_of(
+        result,
+        [
+            replace(row, runs={seed: moved(run, at) for seed, run in row.runs.items()}) if at in chosen else row
+            for at, row in enumerate(result.environments)
+        ],
+    )
+
+
 def test_a_score_within_the_band_holds_and_one_outside_does_not(card):
     """Two draws differ by √2 times what one is off: within the interval alone one replay in six of a true card failed."""
-    score = card.score
-    low, high = (score + 2**0.5 * (end - score) for end in card.score_interval)
-    for value, holds in ((low + 1e-4, True), (high + 1e-4, False), (low - 1e-4, False)):
-        replay = with_row(replace(card, score=value), 0, score=card.environments[0].score + 0.001)
+    reach = 2**0.5 * (card.score_interval[1] - card.score)
+    step = shifted(card, 0.01).score - card.score
+    for part, holds in ((0.9, True), (1.1, False), (-1.1, False)):
+        replay = shifted(card, 0.01 * part * reach / step)
+        assert replay.score == pytest.approx(card.score + part * reach, abs=1e-4)
         found = judge(card, replay)
-        assert (found["holds"], found["equal"], found["replayed"]) == (holds, False, value)
+        assert (found["holds"], found["equal"], found["figures"], found["edited"]) == (holds, False, [], [])
         # a policy that other seeds judge better was not fitted to those of the card
-        assert judge(card, replay, fresh=True)["holds"] == (value > low)
+        assert judge(card, replay, fresh=True)["holds"] == (part > -1)
+
+
+def test_few_runs_that_differ_among_many_that_do_not_were_edited(card):
+    """A processor of another kind changes all of them: within its band, a run of one's own making held."""
+    found = judge(shifted(card, 0.001, rows=[2]), card)
+    assert not found["holds"] and found["edited"] == ["wave, friction 0.4, payload 0 kg"]
+    assert found["runs"] == [9, 12]
+    assert judge(shifted(card, 0.001), card)["holds"]
+
+
+@pytest.mark.parametrize("column", ["lin_vel_err", "dof_power"])
+def test_a_metric_that_was_raised_in_all_runs_does_not_hold(card, column):
+    """All figures follow from the runs, and quality and score stay as they were."""
+
+    def raised(run):
+        tables = ({**table, column: min(table[column] + 0.1, 1.0)} for table in (run.columns, run.mean, run.mean25))
+        columns, mean, mean25 = tables
+        return replace(run, columns=columns, mean=mean, mean25=mean25)
+
+    rows = [replace(row, runs={s: raised(run) for s, run in row.runs.items()}) for row in card.environments]
+    found = judge(made_of(card, rows), card)
+    assert not found["holds"] and f"{column}.mean50" in found["figures"]
 
 
 def test_levels_that_differ_are_listed(card):
@@ -134,8 +177,6 @@ def test_a_card_that_holds_less_than_it_says_is_refused():
         match=r"it calls itself complete, but holds 6 of 7 terrains of robogauge-1\.1; it was changed by hand",
     ):
         check_card(part, suite, "it")
-    with pytest.raises(CardError, match=r"it: score_interval is .*, but that of its trials and runs is"):
-        check_card(replace(part, coverage=Coverage()), suite, "it")  # results from before say nothing of what they hold
 
 
 def test_a_card_of_a_suite_that_names_another_or_has_other_rules_is_refused():
@@ -152,9 +193,9 @@ def test_a_card_of_a_suite_that_names_another_or_has_other_rules_is_refused():
 @pytest.mark.parametrize("interval", [(0.0, 1.0), (0.9, 0.95), None])
 def test_an_interval_that_the_runs_do_not_give_is_refused(card, interval):
     """It was taken as it is printed, and a card with a wide one held whatever its score."""
-    check_card(card, None, "it")
-    with pytest.raises(CardError, match=r"it: score_interval is .*, but that of its trials and runs is"):
-        check_card(replace(card, score_interval=interval), None, "it")
+    check_figures(card, "it", CardError)
+    with pytest.raises(CardError, match=r"it: score_interval is .*, but what it is made of gives \["):
+        check_figures(replace(card, score_interval=interval), "it", CardError)
 
 
 def test_the_band_is_as_wide_as_the_replay_s_interval(card):

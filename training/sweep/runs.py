@@ -292,7 +292,7 @@ def _read_policy(path: Path) -> FilePolicy:
 def read_card(folder: Path) -> Result:
     """Return the result in a folder. Raises ComparisonError: there are none, or they are damaged."""
     try:
-        card = load_result(folder)
+        card = load_result(folder, intervals=False)
         for name in SCORES:
             if name in card.lacking:
                 raise ComparisonError(f"results '{one_line(folder / RESULTS)}' lack {name}")
