@@ -45,6 +45,8 @@ _LATER = frozenset(
     {"action_offset", "layout", "memory", "encoder"} | {"reference", "values", "period", "offsets", "waves", "at_rest"}
 )
 """Fields that hashes of older contracts lack."""
+REPEATABLE = ("gait_phase", "constant")
+"""Terms that an observation may have more than once."""
 RESTING = 0.1
 """Length of a command, speeds [m/s] and [rad/s] alike, below which a gait clock is at rest."""
 _ActionScale = Annotated[float, Field(strict=True, ge=-100.0, le=100.0)]
@@ -75,8 +77,9 @@ class ObservationTerm:
     """Of ``gait_phase``: shares of a cycle by which each clock is ahead, one clock per entry."""
     waves: Annotated[tuple[Literal["sin", "cos"], ...], Field(min_length=1, max_length=2)] = ("sin", "cos")
     """Of ``gait_phase``: functions of the phase; the first one of all clocks, then the second one."""
-    at_rest: Literal["runs", "holds", "zeros"] = "runs"
-    """Of ``gait_phase``, while the command is below ``RESTING``: the clock runs, holds still, or its entries are zero."""
+    at_rest: Literal["runs", "holds", "zeros", "half"] = "runs"
+    """Of ``gait_phase``, while the command is below ``RESTING``: the clock runs, holds still, has entries of zero, or all clocks
+    stand at half a cycle and begin anew afterwards."""
 
     def __post_init__(self) -> None:
         check_fields(self, "contract", ContractError)
@@ -212,7 +215,7 @@ class PolicyContract:
                     f"contract: target_range of {shown(joint)} is {low:g} to {high:g} rad; it must rise"
                 )
         terms = [t.name for t in self.observation]
-        if len(set(terms)) != len(terms):
+        if len(set(once := [t for t in terms if t not in REPEATABLE])) != len(once):
             raise ContractError(f"contract: observation has a term twice: {', '.join(terms)}")
         for term, width in zip(self.observation, self.term_widths, strict=True):
             for name in PER_ENTRY:
@@ -255,15 +258,16 @@ class PolicyContract:
     @cached_property
     def inputs(self) -> Mapping[str, tuple[int, ...]]:
         """Return each input's entries as places in the kept frames (H, F), oldest first, by the input's name, ``""`` for the only one."""
-        begins = dict(zip((t.name for t in self.observation), accumulate((0, *self.term_widths)), strict=False))
-        widths = dict(zip(begins, self.term_widths, strict=True))
+        names, widths = [t.name for t in self.observation], self.term_widths
+        begins = list(accumulate((0, *widths)))
         found: dict[str, tuple[int, ...]] = {}
         for part in self.layout or (Part(),):
             length, order = part.length or self.history.length, part.order or self.history.order
             frames = list(range(self.frames - length, self.frames))
             if order.endswith("newest-first"):
                 frames.reverse()
-            terms = part.terms or tuple(begins)
+            chosen = [i for name in part.terms for i, n in enumerate(names) if n == name]
+            terms = chosen or list(range(len(names)))
             blocks = product(frames, terms) if order.startswith("frame") else ((f, t) for t in terms for f in frames)
             places = (self.frame_width * f + begins[t] + i for f, t in blocks for i in range(widths[t]))
             found[part.input] = found.get(part.input, ()) + tuple(places)

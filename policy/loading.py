@@ -13,27 +13,17 @@ from typing import TYPE_CHECKING
 from ..files.parsing import shown
 from ..robots import Robot, load_robot
 from .base import PolicyError
-from .contract import ContractError, HistoryOrder, PolicyContract, check_robot, standard_contract
+from .contract import HistoryOrder, PolicyContract, check_robot, standard_contract
 from .finding import find_policy
-from .foreign.adapters import (
-    LONGEST_HISTORY,
-    assumptions,
-    contract_for_width,
-    deploy_contract,
-    find_deploy_file,
-    mjlab_contract,
-    sidecar_contract,
-)
-from .foreign.described import described_contract
+from .foreign.adapters import LONGEST_HISTORY, contract_for_width, described
+from .foreign.bodies import DEFAULT_ROBOT
 from .foreign.fence.archive import archive_names, read_limited
+from .foreign.readers import Facts, find_description, read_description
 from .foreign.rsl_rl import checkpoint_network
 from .native import FilePolicy, ForeignFile, NativePolicy, StoredNetwork, is_policy, load_entries, read_policy
 
 if TYPE_CHECKING:
-    from .foreign.fence.child import Child
     from .foreign.fenced_policy import Started
-
-DEFAULT_ROBOT = "go2"
 
 
 def load_policy(
@@ -54,8 +44,8 @@ def load_policy(
         robot: the robot it has to fit, and whose data stand in where a foreign file does not say; None: any robot is
             accepted, and the Go2 stands in.
         trust: run a program that a file of the project's own format carries inside; it is fenced in either way.
-        contract_file: a ``contract.toml`` that says how a file without a contract of its own is to be run; it goes before
-            all else.
+        contract_file: a description of how a file without a contract of its own is to be run, of this project or of one
+            that is understood (``foreign.readers``); it goes before all else.
 
     Raises:
         PolicyError: no such file or name, a damaged or foreign file, or a network that does not fit its contract.
@@ -63,11 +53,10 @@ def load_policy(
     """
     path = find_policy(path_or_name)
     data = read_limited(path)
-    stand_in = robot or load_robot(DEFAULT_ROBOT)
-    contract = None if contract_file is None else described_contract(Path(contract_file), stand_in)
-    policy = _load(data, path, str(path_or_name), stand_in, trust=trust, contract=contract)
+    given = None if contract_file is None else Path(contract_file)
+    policy = _load(data, path, str(path_or_name), robot, trust=trust, given=given)
     policy.file_sha256 = hashlib.sha256(data).hexdigest()
-    if sentence := assumptions(policy.contract):
+    if sentence := described(policy.contract):
         _say(policy.path, sentence)
     if robot is not None:
         check_robot(policy.contract, robot)
@@ -104,19 +93,17 @@ def restore_policy(
 
 @cache  # once, and not again in each process that is forked from this one
 def _say(path: str, sentence: str) -> None:
-    logging.getLogger(__name__).warning("'%s' does not say how it is to be run; %s", path, sentence)
+    logging.getLogger(__name__).warning("'%s' %s", path, sentence)
 
 
-def _load(
-    data: bytes, path: Path, source: str, robot: Robot, *, trust: bool, contract: PolicyContract | None
-) -> FilePolicy:
+def _load(data: bytes, path: Path, source: str, robot: Robot | None, *, trust: bool, given: Path | None) -> FilePolicy:
     """Load a file's content; ``path`` is where its sidecars are, ``source`` what the user called it."""
     kind = file_kind(data, source)
     if kind in ("torchscript", "onnx"):
-        return _foreign(ForeignFile(kind=kind, data=data), path, source, robot, contract=contract)
+        return _foreign(ForeignFile(kind=kind, data=data), path, source, robot, contract=given)
     entries = load_entries(data, source=source)
     if is_policy(entries):
-        if contract is not None:
+        if given is not None:
             raise PolicyError(f"'{source}' has its contract inside; leave out --contract, or import its source again")
         inside, network = read_policy(entries, source=source)
         if isinstance(network, StoredNetwork):
@@ -127,7 +114,8 @@ def _load(
                 "add --trust (in Python trust=True) to run it, in a process of its own"
             )
         return _foreign(network, path, source, robot, contract=inside)
-    found = checkpoint_network(entries, robot, path=path, contract=contract or sidecar_contract(path, robot))
+    read = find_description(path, robot, Facts()) if given is None else read_description(given, robot, Facts())
+    found = checkpoint_network(entries, robot or load_robot(DEFAULT_ROBOT), path=path, contract=read)
     if found is None:
         raise PolicyError(f"'{source}' is a torch.save file, but neither a gaitgauge policy nor an rsl_rl checkpoint")
     described, network = found
@@ -135,13 +123,21 @@ def _load(
 
 
 def _foreign(
-    file: ForeignFile, path: Path, source: str, robot: Robot, *, contract: PolicyContract | None = None
+    file: ForeignFile,
+    path: Path,
+    source: str,
+    robot: Robot | None,
+    *,
+    contract: PolicyContract | Path | None = None,
 ) -> FilePolicy:
-    """Load a TorchScript or ONNX file; ``contract`` is the one that was stored with it or given, None to look for one."""
+    """Load a TorchScript or ONNX file; ``contract`` is the one that was stored with it, a file with it, or None to look for one."""
     from .foreign.fenced_policy import FencedPolicy  # only those who load such a file wait for what it needs
 
     file, program, metadata = _start(file, source, path.parent)
-    contract = contract or _foreign_contract(program.child, file.kind, metadata, path, source, robot)
+    if isinstance(contract, Path):
+        facts = Facts(inputs=program.child.ask("inputs")["names"], metadata=metadata)
+        contract = read_description(contract, robot, facts)
+    contract = contract or _foreign_contract(program, file.kind, metadata, path, source, robot)
     encoder = None
     if contract.encoder is not None:
         inner = file.encoder or _beside(path, contract.encoder.file, source)
@@ -183,29 +179,18 @@ def _start(file: ForeignFile, source: str, folder: Path) -> tuple[ForeignFile, S
 
 
 def _foreign_contract(
-    child: Child, kind: str, metadata: Mapping[str, str], path: Path, source: str, robot: Robot
+    program: Started, kind: str, metadata: Mapping[str, str], path: Path, source: str, robot: Robot | None
 ) -> PolicyContract:
-    """Return the contract beside a file or in it, of its deploy.yaml or mjlab metadata, or else the standard one of the input's width."""
-    contract = sidecar_contract(path, robot)
-    if contract is None and "contract" in metadata:
-        contract = _stored_contract(metadata["contract"], source)
-    if contract is None and kind == "onnx":
-        deploy = find_deploy_file(path)
-        contract = deploy_contract(deploy, robot) if deploy else mjlab_contract(metadata, robot, source=source)
-    if contract is not None:
-        return contract
+    """Return the contract beside a file or in it, that of another project's description, or else the standard one of the input's width."""
+    facts = Facts(inputs=program.child.ask("inputs")["names"], metadata=metadata)
+    if (found := find_description(path, robot, facts)) is not None:
+        return found
+    robot = robot or load_robot(DEFAULT_ROBOT)
     frame = standard_contract(robot).frame_width
     order: HistoryOrder = "term-major" if kind == "onnx" else "frame-major"
-    width = child.ask("width", candidates=[frame * n for n in range(1, LONGEST_HISTORY + 1)])["width"]
+    width = program.child.ask("width", candidates=[frame * n for n in range(1, LONGEST_HISTORY + 1)])["width"]
     provenance = {"adapter": "ONNX" if kind == "onnx" else "TorchScript", "file": path.name}
     return contract_for_width(int(width or frame), robot, order=order, provenance=provenance, source=source)
-
-
-def _stored_contract(text: str, source: str) -> PolicyContract:
-    try:
-        return PolicyContract.from_json(text)
-    except ContractError as error:
-        raise PolicyError(f"'{source}' carries a malformed contract: {error}") from error
 
 
 def file_kind(data: bytes, source: str) -> str:

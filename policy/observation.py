@@ -152,9 +152,13 @@ class ObservationBuilder:
         assert term.period is not None  # of the term's own check
         clock, resting = self._clocks[:, number], command.norm(dim=1) < RESTING
         cycles = (clock * (self.contract.control_period / term.period))[:, None] + self._clock_offsets[number]
+        if term.at_rest == "half":
+            cycles = torch.where(resting[:, None], 0.5, cycles)
         angle = 2.0 * torch.pi * torch.remainder(cycles, 1.0)
         found = torch.cat([torch.sin(angle) if wave == "sin" else torch.cos(angle) for wave in term.waves], dim=1)
-        clock.add_((~resting).to(clock.dtype) if term.at_rest == "holds" else 1.0)
+        clock.add_((~resting).to(clock.dtype) if term.at_rest in ("holds", "half") else 1.0)
+        if term.at_rest == "half":
+            clock.masked_fill_(resting, 0.0)
         return found.masked_fill(resting[:, None], 0.0) if term.at_rest == "zeros" else found
 
     def _in_order(self, frames: torch.Tensor) -> torch.Tensor:

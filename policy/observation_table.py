@@ -202,6 +202,22 @@ _OWN = (
         foreign_names=("last_action", "actions"),
         policy_order=True,
     ),
+    Observation(
+        name="command_linear",
+        build=lambda state, command, last_action: command[:, :2],
+        width=2,
+        unit="m/s",
+        mirror=(1.0, -1.0),
+        foreign_names=("command_lin_vel",),
+    ),
+    Observation(
+        name="command_turning",
+        build=lambda state, command, last_action: command[:, 2:],
+        width=1,
+        unit="rad/s",
+        mirror=(-1.0,),
+        foreign_names=("command_ang_vel",),
+    ),
     # The next two have no function of the state: the builder makes them of what the contract's term says.
     Observation(
         name="gait_phase",

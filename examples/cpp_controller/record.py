@@ -19,7 +19,7 @@ from gaitgauge.backends.registry import make_backend
 from gaitgauge.gauge.motors import joint_parameters
 from gaitgauge.gauge.suite import load_suite
 from gaitgauge.policy.contract import PolicyContract
-from gaitgauge.policy.foreign.adapters import deploy_contract
+from gaitgauge.policy.foreign.deploy_yaml import deploy_contract
 from gaitgauge.policy.loading import load_policy
 from gaitgauge.policy.observation import ObservationBuilder
 from gaitgauge.policy.robot_of import robot_for

@@ -11,9 +11,10 @@ from ...files.parsing import parse_toml, read_text
 from ...robots.base import Robot
 from ..base import PolicyError
 from ..contract import PER_ENTRY, PER_JOINT, ContractError, PolicyContract, reordered, standard_contract
+from .bodies import choose_robot
 
 
-def described_contract(path: Path, robot: Robot) -> PolicyContract:
+def described_contract(path: Path, asked: Robot | None) -> PolicyContract:
     """Read a ``contract.toml``: fields of ``PolicyContract``; fields left out are the robot's standard ones. Where
     it lists the joints in an order of its own, standard values per joint go with their joints. One number stands for all
     joints, or for all entries of an observation.
@@ -23,6 +24,8 @@ def described_contract(path: Path, robot: Robot) -> PolicyContract:
     """
     source = f"contract file '{path}'"
     data = parse_toml(read_text(path, "contract file", PolicyError), source, PolicyError)
+    named = data.get("robot")
+    robot = choose_robot(asked, named if asked is None and isinstance(named, str) else None, path)
     provenance = {"adapter": "contract.toml", "file": path.name}
     standard = standard_contract(robot, provenance=provenance)
     names = data.get("joint_names")

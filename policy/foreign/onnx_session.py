@@ -162,6 +162,8 @@ class GraphProgram:
         """Answer ``width`` with the only input's width, None for any, and ``prepare`` with whether a batched form was found, or with
         the input's width where it is not the interface's.
         """
+        if request["do"] == "inputs":
+            return {"names": [i.name for i in self._sorted(())[0]]}
         if request["do"] == "width":
             return {"width": self._width()}
         interface = Interface.from_dict(request["interface"])

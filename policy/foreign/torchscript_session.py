@@ -202,6 +202,8 @@ class ScriptProgram:
         """Answer ``width`` with the width that the module takes, and ``prepare`` with whether it runs in batches, or with the width
         that it takes in place of the interface's.
         """
+        if request["do"] == "inputs":
+            return {"names": argument_names(self._module)}
         if request["do"] == "width":
             return {"width": input_width(self._module, request["candidates"], source=self.source)}
         interface = Interface.from_dict(request["interface"])

@@ -7,8 +7,9 @@ from pathlib import Path
 
 from fuzzing import SEEDS, register
 from gaitgauge.policy.base import PolicyError
-from gaitgauge.policy.foreign.adapters import deploy_contract, sidecar_contract
+from gaitgauge.policy.foreign.deploy_yaml import deploy_contract
 from gaitgauge.policy.foreign.fence.archive import packed, read_archive
+from gaitgauge.policy.foreign.readers import Facts, find_description
 from gaitgauge.policy.loading import load_policy
 from gaitgauge.robots import load_robot
 
@@ -66,7 +67,7 @@ def _deploy(content: bytes, folder: Path) -> None:
 def _sidecar(content: bytes, folder: Path) -> None:
     path = folder / "contract.json"
     path.write_bytes(content)
-    if sidecar_contract(folder / "policy.pt", ROBOT) is None:
+    if find_description(folder / "policy.pt", ROBOT, Facts()) is None:
         raise PolicyError("there is no contract")
 
 

@@ -10,8 +10,9 @@ import pytest
 import torch
 from gaitgauge.policy.base import LONGEST_MESSAGE, PolicyError
 from gaitgauge.policy.finding import find_policy
-from gaitgauge.policy.foreign.adapters import deploy_contract, sidecar_contract
+from gaitgauge.policy.foreign.deploy_yaml import deploy_contract
 from gaitgauge.policy.foreign.fence import archive, pickles
+from gaitgauge.policy.foreign.readers import Facts, find_description
 from gaitgauge.policy.loading import load_policy
 from gaitgauge.policy.native import checksum, save_policy
 from gaitgauge.robots import load_robot
@@ -195,7 +196,7 @@ def test_contracts_that_are_none(tmp_path, cts_file, text):
     refused(cts_file, "cts.gauge.pt")
     (tmp_path / "contract.json").write_text(text)
     with pytest.raises(PolicyError, match=r"contract\.json"):
-        sidecar_contract(tmp_path / "policy.pt", load_robot("go2"))
+        find_description(tmp_path / "policy.pt", None, Facts())
 
 
 @pytest.mark.parametrize(

@@ -21,8 +21,9 @@ from gaitgauge.policy.export.files import (
     mjlab_metadata,
     term_major_order,
 )
-from gaitgauge.policy.foreign.adapters import deploy_contract, mjlab_contract
+from gaitgauge.policy.foreign.deploy_yaml import deploy_contract
 from gaitgauge.policy.foreign.fenced_policy import FencedPolicy
+from gaitgauge.policy.foreign.mjlab import mjlab_contract
 from gaitgauge.policy.importing import import_policy
 from gaitgauge.policy.loading import load_policy
 from gaitgauge.policy.native import NativePolicy, StoredNetwork

@@ -14,7 +14,7 @@ from gaitgauge.gauge.suite import load_suite
 from gaitgauge.policy.base import Policy, PolicySession
 from gaitgauge.policy.contract import History, ObservationTerm, standard_contract
 from gaitgauge.policy.export.files import deploy_settings, export_deploy, export_unitree, first_steps, term_major_order
-from gaitgauge.policy.foreign.adapters import deploy_contract
+from gaitgauge.policy.foreign.deploy_yaml import deploy_contract
 from gaitgauge.policy.loading import load_policy
 from gaitgauge.policy.native import NativePolicy
 from gaitgauge.robots import load_robot

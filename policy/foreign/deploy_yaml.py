@@ -1,0 +1,106 @@
+"""Reads a ``deploy.yaml`` as the exporters of unitree_rl_lab, unitree_rl_mjlab and RoboGauge's projects write it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from ...files.parsing import parse_yaml, read_text
+from ...robots.base import Robot
+from ..base import PolicyError
+from ..contract import History, HistoryOrder, ObservationTerm, Part, PolicyContract
+from .bodies import choose_robot, no_wheels, sdk_joints
+from .terms import checked, clip_before_scaling, listed, own_term, symmetric
+
+
+def is_deploy(data: Mapping[str, Any]) -> bool:
+    """Return whether a table is one."""
+    return "joint_ids_map" in data and "actions" in data
+
+
+def deploy_contract(path: Path, robot: Robot) -> PolicyContract:
+    """Read a ``deploy.yaml``, see ``read_deploy``."""
+    data = parse_yaml(read_text(path, "deploy file", PolicyError), f"'{path}'", PolicyError)
+    if not isinstance(data, Mapping):
+        raise PolicyError(f"'{path}' holds no table of settings")
+    return read_deploy(data, path, robot)
+
+
+def read_deploy(data: Mapping[str, Any], path: Path, asked: Robot | None) -> PolicyContract:
+    """Return the contract that a ``deploy.yaml`` describes.
+
+    In it ``stiffness`` and ``damping`` are in the order of the robot's SDK, everything else is in the policy's; entry i
+    of ``joint_ids_map`` is the SDK's number of the policy's joint i. Histories are term-major unless
+    ``use_gym_history`` is set, and start with copies of the first observation. Clipping comes before scaling unless
+    ``scale_first`` is set; a clip of the action limits the joint target.
+
+    Raises:
+        PolicyError: the file is malformed, or asks for something that a contract cannot express.
+    """
+    with checked(path, "deploy.yaml"):
+        return _read(data, path, choose_robot(asked, None, path))
+
+
+def _read(data: Mapping[str, Any], path: Path, robot: Robot) -> PolicyContract:
+    names = sdk_joints(robot, list(data["joint_ids_map"]), path, "joint_ids_map")
+    sdk = [int(i) for i in data["joint_ids_map"]]
+    default = [float(v) for v in data["default_joint_pos"]]
+    actions = dict(data["actions"])
+    wheels = actions.get("JointVelocityAction")
+    no_wheels(listed(wheels.get("joint_names"), "some", 1) if isinstance(wheels, Mapping) else (), path)
+    action = actions["JointPositionAction"]
+    offset = (
+        [float(v) for v in listed(action.get("offset"), 0.0, len(names))]
+        if action.get("offset") is not None
+        else default
+    )
+    moved = max((abs(o - d) for o, d in zip(offset, default, strict=True)), default=0.0) > 1e-6
+    clip = action.get("clip")
+    ranges = ((data.get("commands") or {}).get("base_velocity") or {}).get("ranges") or {}
+    axes = ("lin_vel_x", "lin_vel_y", "ang_vel_z")
+    limits = [
+        max(abs(float(v)) for v in ranges[axis]) if ranges.get(axis) else robot.command_limits[i]
+        for i, axis in enumerate(axes)
+    ]
+    settings = dict(data["observations"])
+    frame_major = bool(settings.pop("use_gym_history", False))
+    scale_first = bool(settings.pop("scale_first", False))
+    terms, lengths = [], []
+    for name, term in settings.items():
+        own, scale = own_term(name, path), tuple(float(s) for s in listed(term.get("scale"), 1.0))
+        clip_of_term = None
+        if (given := term.get("clip")) is not None:
+            limit = symmetric(float(given[0]), float(given[1]), name, path)
+            clip_of_term = (limit,) if scale_first else clip_before_scaling(limit, scale)
+        period = float((term.get("params") or {})["period"]) if own == "gait_phase" else None
+        terms.append(ObservationTerm(name=own, scale=scale, clip=clip_of_term, period=period))
+        lengths.append(int(term.get("history_length") or 1))
+    longest = max(lengths, default=1)
+    alike = len(set(lengths)) <= 1
+    if frame_major and not alike:
+        raise PolicyError(
+            f"'{path}' gives its observations histories of different lengths {sorted(set(lengths))} in whole frames; one "
+            "length is needed"
+        )
+    order: HistoryOrder = "frame-major" if frame_major or longest == 1 else "term-major"
+    parts = () if alike else tuple(Part(terms=(t.name,), length=n) for t, n in zip(terms, lengths, strict=True))
+    provenance = {"adapter": "deploy.yaml", "file": path.name}
+    if missing := [axis for axis in axes if not ranges.get(axis)]:
+        provenance["assumed"] = f"command limits of robot '{robot.name}' ({', '.join(missing)})"
+    return PolicyContract(
+        robot=robot.name,
+        joint_names=names,
+        default_joint_position=tuple(default),
+        action_scale=tuple(float(v) for v in listed(action.get("scale"), 1.0, len(names))),
+        action_offset=tuple(offset) if moved else None,
+        target_range=tuple((float(low), float(high)) for low, high in clip) if clip else None,
+        stiffness=tuple(float(data["stiffness"][i]) for i in sdk),
+        damping=tuple(float(data["damping"][i]) for i in sdk),
+        control_period=float(data["step_dt"]),
+        observation=tuple(terms),
+        history=History(length=longest, order=order, start="repeat"),
+        layout=parts,
+        command_limits=(limits[0], limits[1], limits[2]),
+        provenance=provenance,
+    )

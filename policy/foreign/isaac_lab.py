@@ -1,0 +1,175 @@
+"""Reads the ``params/env.yaml`` that Isaac Lab leaves in a run, with the ``agent.yaml`` beside it."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from ...files.parsing import parse_yaml, read_text, shown
+from ...robots.base import Robot
+from ..base import PolicyError
+from ..contract import History, ObservationTerm, Part, PolicyContract
+from .bodies import breadth_first, by_pattern, choose_robot, no_wheels
+from .terms import checked, clip_before_scaling, listed, symmetric
+
+_FUNCTIONS = {
+    "base_lin_vel": "base_linear_velocity_b",
+    "base_ang_vel": "base_angular_velocity_b",
+    "projected_gravity": "projected_gravity_b",
+    "generated_commands": "command",
+    "joint_pos_rel": "joint_position",
+    "joint_pos": "joint_position",
+    "joint_vel_rel": "joint_velocity",
+    "joint_vel": "joint_velocity",
+    "last_action": "last_action",
+    "gait_phase": "gait_phase",
+    "phase": "gait_phase",
+}
+"""Isaac Lab's functions of observations, and the project's terms."""
+
+
+def is_env(data: Mapping[str, Any]) -> bool:
+    """Return whether a table is one."""
+    return {"scene", "observations", "actions", "decimation"} <= data.keys()
+
+
+def read_env(data: Mapping[str, Any], path: Path, asked: Robot | None) -> PolicyContract:
+    """Return the contract that an ``env.yaml`` describes.
+
+    Joints are in Isaac Lab's order, those nearest to the base first. Histories are term-major and start with copies of the first
+    observation; clipping comes before scaling; a clip of the action limits the joint target. ``clip_actions`` of the
+    ``agent.yaml`` limits the network's output.
+
+    Raises:
+        PolicyError: the file is malformed, is for another robot, or asks for something that a contract cannot express.
+    """
+    with checked(path, "Isaac Lab's env.yaml"):
+        body = data["scene"]["robot"]
+        asset = str((body.get("spawn") or {}).get("usd_path") or (body.get("spawn") or {}).get("asset_path") or "")
+        named = re.search(r"([A-Za-z0-9_-]+)\.(usda?|urdf|xml)$", asset)
+        return _read(data, path, choose_robot(asked, None if named is None else _short(named[1]), path))
+
+
+def _short(name: str) -> str:
+    """Return a robot's name without its maker's and without what follows it."""
+    return re.sub(r"^(unitree|anymal)_(?=\w)", lambda m: "" if m[1] == "unitree" else m[0], name.lower()).split(
+        "_minimal"
+    )[0]
+
+
+def _read(data: Mapping[str, Any], path: Path, robot: Robot) -> PolicyContract:
+    names = breadth_first(robot)
+    body = data["scene"]["robot"]
+    gains: dict[str, list[Any]] = {"stiffness": [None] * len(names), "damping": [None] * len(names)}
+    for group in body["actuators"].values():
+        mine = [n for n in names if any(re.fullmatch(p, n) for p in listed(group["joint_names_expr"], ".*"))]
+        for entry, values in gains.items():
+            given = group[entry]
+            table = given if isinstance(given, Mapping) else dict.fromkeys(map(re.escape, mine), given)
+            for name, value in zip(mine, by_pattern(table, mine, None, path, entry), strict=True):
+                values[names.index(name)] = value
+    if None in gains["stiffness"]:
+        raise PolicyError(
+            f"'{path}' has no actuator for joint '{names[gains['stiffness'].index(None)]}' of robot '{robot.name}'"
+        )
+    default = by_pattern(body["init_state"]["joint_pos"], names, 0.0, path, "init_state.joint_pos")
+    position = [a for a in data["actions"].values() if "JointPositionAction" in str(a.get("class_type"))]
+    others = [a for a in data["actions"].values() if a not in position]
+    no_wheels(
+        [n for a in others if "Velocity" in str(a.get("class_type")) for n in listed(a.get("joint_names"), "")], path
+    )
+    if len(position) != 1 or others:
+        kinds = ", ".join(str(a.get("class_type")).rpartition(":")[2] for a in data["actions"].values())
+        raise PolicyError(f"'{path}' has the actions {kinds}; one JointPositionAction is supported")
+    (action,) = position
+    if any(not any(re.fullmatch(p, n) for p in listed(action.get("joint_names"), ".*")) for n in names):
+        raise PolicyError(f"'{path}' moves some joints of robot '{robot.name}' alone; all of them are needed")
+
+    def spread(value: Any, entry: str) -> list[float]:
+        table = value if isinstance(value, Mapping) else {".*": value}
+        return [float(v) for v in by_pattern(table, names, 0.0, path, entry)]
+
+    moved = None if action.get("use_default_offset", True) else tuple(spread(action.get("offset") or 0.0, "offset"))
+    clip = action.get("clip")
+    ranges = None
+    if clip:
+        free = (-1000.0, 1000.0)
+        ranges = tuple((float(a), float(b)) for a, b in by_pattern(clip, names, free, path, "clip"))
+    terms, parts, longest = _observation(data["observations"]["policy"], path)
+    limits, missing = _limits(data, robot)
+    assumed = ["joints nearest to the base first, as Isaac Lab lists them"]
+    if missing:
+        assumed.append(f"command limits of robot '{robot.name}'")
+    return PolicyContract(
+        robot=robot.name,
+        joint_names=names,
+        default_joint_position=tuple(float(v) for v in default),
+        action_scale=tuple(spread(action.get("scale", 1.0), "scale")),
+        action_offset=moved,
+        action_clip=_action_clip(path),
+        target_range=ranges,
+        stiffness=tuple(float(v) for v in gains["stiffness"]),
+        damping=tuple(float(v) for v in gains["damping"]),
+        control_period=round(float(data["sim"]["dt"]) * int(data["decimation"]), 9),
+        observation=terms,
+        history=History(length=longest, order="frame-major" if longest == 1 else "term-major", start="repeat"),
+        layout=parts,
+        command_limits=limits,
+        provenance={"adapter": "Isaac Lab env.yaml", "file": path.name, "assumed": ", ".join(assumed)},
+    )
+
+
+def _observation(group: Mapping[str, Any], path: Path) -> tuple[tuple[ObservationTerm, ...], tuple[Part, ...], int]:
+    """Return the terms, the parts where histories differ, and the longest history."""
+    terms, lengths = [], []
+    for name, term in group.items():
+        if not isinstance(term, Mapping) or "func" not in term:
+            continue  # settings of the whole group, and terms that were switched off
+        function = str(term["func"]).rpartition(":")[2]
+        if function not in _FUNCTIONS:
+            raise PolicyError(
+                f"'{path}' asks for the observation {shown(name)} ({function}); supported are: {', '.join(_FUNCTIONS)}"
+            )
+        scale = tuple(float(v) for v in listed(term.get("scale"), 1.0))
+        limit = (
+            None if term.get("clip") is None else symmetric(float(term["clip"][0]), float(term["clip"][1]), name, path)
+        )
+        terms.append(
+            ObservationTerm(
+                name=_FUNCTIONS[function],
+                scale=scale,
+                clip=None if limit is None else clip_before_scaling(limit, scale),
+                reference=(0.0,) if function == "joint_pos" else None,
+                period=float(term["params"]["period"]) if _FUNCTIONS[function] == "gait_phase" else None,
+            )
+        )
+        lengths.append(max(int(group.get("history_length") or term.get("history_length") or 0), 1))
+    alike = len(set(lengths)) <= 1
+    parts = () if alike else tuple(Part(terms=(t.name,), length=n) for t, n in zip(terms, lengths, strict=True))
+    return tuple(terms), parts, max(lengths, default=1)
+
+
+def _limits(data: Mapping[str, Any], robot: Robot) -> tuple[tuple[float, float, float], bool]:
+    """Return the largest commands, and whether the file does not say them all."""
+    commands = data.get("commands") or {}
+    velocity = next(
+        (c for c in commands.values() if isinstance(c, Mapping) and "lin_vel_x" in (c.get("ranges") or {})), {}
+    )
+    ranges = velocity.get("limit_ranges") or velocity.get("ranges") or {}
+    axes = ("lin_vel_x", "lin_vel_y", "ang_vel_z")
+    found = [
+        max(abs(float(v)) for v in ranges[a]) if ranges.get(a) else robot.command_limits[i] for i, a in enumerate(axes)
+    ]
+    return (found[0], found[1], found[2]), any(not ranges.get(a) for a in axes)
+
+
+def _action_clip(path: Path) -> float | None:
+    """Return the ``clip_actions`` of the ``agent.yaml`` beside an ``env.yaml``."""
+    agent = path.with_name("agent.yaml")
+    if not agent.is_file():
+        return None
+    data = parse_yaml(read_text(agent, "training configuration", PolicyError), f"'{agent}'", PolicyError)
+    found = data.get("clip_actions") if isinstance(data, Mapping) else None
+    return float(found) if found else None

@@ -1,0 +1,75 @@
+"""Reads the metadata that mjlab's exporter writes into an ONNX file."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+from ...robots.base import Robot
+from ..base import PolicyError
+from ..contract import History, ObservationTerm, PolicyContract
+from .bodies import choose_robot, matching_joint
+from .terms import checked, clip_before_scaling, own_term, symmetric
+
+
+def mjlab_contract(metadata: Mapping[str, str], asked: Robot | None, *, source: str) -> PolicyContract | None:
+    """Return the contract that the metadata describe; None if they are not there.
+
+    Histories are term-major and start with copies of the first observation. The command limits are the robot's and the
+    control period is 0.02 s, mjlab's, because the metadata name neither.
+
+    Raises:
+        PolicyError: the metadata are incomplete or malformed.
+    """
+    if "observation_names" not in metadata or "joint_names" not in metadata:
+        return None
+    with checked(source, "mjlab's metadata"):
+        return _mjlab_contract(metadata, choose_robot(asked, None, source), source)
+
+
+def _mjlab_contract(metadata: Mapping[str, str], robot: Robot, source: str) -> PolicyContract:
+    def words(key: str, default: str = "") -> list[str]:
+        return [w.strip() for w in metadata.get(key, default).split(",") if w.strip()]
+
+    names = tuple(matching_joint(n, robot) for n in words("joint_names"))
+    observations = words("observation_names")
+    own = [own_term(name, source) for name in observations]
+    if "gait_phase" in own:
+        raise PolicyError(
+            f"'{source}' observes a gait phase and its metadata do not say the period; give a contract.toml or deploy.yaml (--contract)"
+        )
+    count = len(observations)
+    scales = words("observation_terms_scale") or ["1.0"] * count
+    clips = words("observation_terms_clip") or ["-inf;inf"] * count
+    lengths = {max(1, int(float(n))) for n in words("observation_terms_history_length")}
+    if len(lengths) > 1:
+        raise PolicyError(
+            f"'{source}' gives its observations histories of different lengths {sorted(lengths)}; one length is needed"
+        )
+    length = lengths.pop() if lengths else 1
+    terms = []
+    for name, term, listed, pair in zip(observations, own, scales, clips, strict=True):
+        scale = tuple(float(s) for s in listed.split(";"))
+        low, high = (float(v) for v in pair.split(";"))
+        limit = symmetric(low, high, name, source)
+        clip = clip_before_scaling(limit, scale)
+        known = None if limit == math.inf else clip if len(clip) > 1 else clip[0]
+        terms.append(ObservationTerm(name=term, scale=scale, clip=known))
+    action_scale = [float(v) for v in words("action_scale")]
+    return PolicyContract(
+        robot=robot.name,
+        joint_names=names,
+        default_joint_position=tuple(float(v) for v in words("default_joint_pos")),
+        action_scale=tuple(action_scale * len(names) if len(action_scale) == 1 else action_scale),
+        stiffness=tuple(float(v) for v in words("joint_stiffness")),
+        damping=tuple(float(v) for v in words("joint_damping")),
+        control_period=0.02,
+        observation=tuple(terms),
+        history=History(length=length, order="frame-major" if length == 1 else "term-major", start="repeat"),
+        command_limits=robot.command_limits,
+        provenance={
+            "adapter": "mjlab metadata",
+            "file": source,
+            "assumed": f"control period 0.02 s, command limits of robot '{robot.name}'",
+        },
+    )
