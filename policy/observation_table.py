@@ -162,7 +162,7 @@ _OWN = (
         mirror=_PLANAR_COMMAND,
         scale=(2.0, 2.0, 0.25),
         scales_in_use=((1.0,), (2.0, 2.0, 0.25)),
-        foreign_names=("velocity_commands", "command"),
+        foreign_names=("velocity_commands", "command", "keyboard_velocity_commands"),
     ),
     Observation(
         name="pose_command",
