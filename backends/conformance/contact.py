@@ -113,8 +113,7 @@ def moment(bench: Bench) -> str:
     """The ground moment is about the mean contact point; at rest its pressure is below the centre of mass."""
     with bench.worlds(bench.stiff()) as worlds:
         state = stand_still(bench, worlds, xy=[[0.0, 0.0], [0.8, 0.0], [0.0, -0.7], [1.0, 1.0]])
-        radius = Reference(bench.robot, bench.stiff()).foot_radius
-        points = state.foot_position_w - [0.0, 0.0, radius]
+        points = state.foot_position_w - [0.0, 0.0, Reference(bench.robot, bench.stiff()).foot_radius]
         expect_close("contact_center_w [m]", state.contact_center_w, points.mean(1), 0.005)
         expected = np.cross(points - state.contact_center_w[:, None, :], state.foot_contact_force_w).sum(1)
         # rolling and torsional friction of six-dimensional contacts add moments of their own

@@ -143,15 +143,14 @@ def frames(bench: Bench) -> str:
             midway = 0.5 * (before.base_linear_velocity_w + after.base_linear_velocity_w)
             # Explicit, midpoint and semi-implicit integrators all move with a velocity between the old and the new one.
             slack = 0.5 * np.abs(after.base_linear_velocity_w - before.base_linear_velocity_w)
-            what = "change of {} per second against {}"
-            linear = what.format("base_position_w", "base_linear_velocity_w [m/s]")
+            linear = "change of base_position_w per second against base_linear_velocity_w [m/s]"
             expect_close(linear, moved, midway, slack + 5e-3)
             for row in range(worlds.count):
                 spin = 0.5 * (before.base_angular_velocity_b[row] + after.base_angular_velocity_b[row])
                 expected = composed(before.base_quaternion_w[row], axis_angle(spin, h * float(np.linalg.norm(spin))))
                 off = float(angle_between(after.base_quaternion_w[row], expected)) / h
                 change = np.linalg.norm(after.base_angular_velocity_b[row] - before.base_angular_velocity_b[row])
-                angular = what.format("base_quaternion_w", "base_angular_velocity_b [rad/s]")
+                angular = "change of base_quaternion_w per second against base_angular_velocity_b [rad/s]"
                 expect_close(angular, off, 0.0, change + 5e-3)
             before = after
     return ""

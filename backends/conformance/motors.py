@@ -197,8 +197,7 @@ def step_response(bench: Bench) -> str:
 @check("motors/joint_friction", "joint_friction")
 def joint_friction(bench: Bench) -> str:
     """Dry friction, viscous damping and rotor inertia of the joints act as in the reference."""
-    parameters = bench.soft(friction_loss=0.2, joint_damping=0.1, armature=0.02)
-    with bench.worlds(parameters) as worlds:
+    with bench.worlds(bench.soft(friction_loss=0.2, joint_damping=0.1, armature=0.02)) as worlds:
         asked = posed(bench, worlds.count, seed=12)
         asked["joint_velocity"] = 3.0 * np.sign(asked["joint_velocity"])
         worlds.reset(**asked)

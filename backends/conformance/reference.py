@@ -218,8 +218,7 @@ def level_stance(reference: Reference, *, clearance: float = 0.0005) -> Stance:
     normal /= np.linalg.norm(normal)
     # the shortest turn that brings the feet's normal upright
     axis = np.cross(normal, [0.0, 0.0, 1.0])
-    angle = float(np.arctan2(np.linalg.norm(axis), normal[2]))
-    quaternion = axis_angle(axis, angle)
+    quaternion = axis_angle(axis, float(np.arctan2(np.linalg.norm(axis), normal[2])))
     lowest = min(float(rotated(quaternion, foot)[2]) for foot in feet)
     return Stance(height=reference.foot_radius - lowest + clearance, quaternion=quaternion)
 

@@ -129,8 +129,6 @@ class MujocoBackend(PhysicsBackend):
         """Return the snapshot of the last ``step(sample_at=…)``."""
         return self._sample
 
-    # ---- acting -------------------------------------------------------------------------------------------------
-
     def _rows(self, worlds: torch.Tensor | None) -> NDArray[np.int64]:
         """Return the indices of the masked worlds."""
         return self._everyone if worlds is None else np.flatnonzero(worlds.numpy())
@@ -319,8 +317,6 @@ class MujocoBackend(PhysicsBackend):
         new = self._warning_counts(rows) > self._warned[rows]
         self._state.flags["diverged"][rows] |= new[:, 0]
         self._state.flags["overflowed"][rows] |= new[:, 1]
-
-    # ---- changing the model ---------------------------------------------------------------------------------------
 
     def randomize(self, randomization: Randomization, worlds: torch.Tensor | None = None) -> None:
         """See ``PhysicsBackend.randomize``. Worlds without a change are skipped: a model's constants are slow to compute."""
