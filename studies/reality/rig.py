@@ -296,6 +296,8 @@ class FixedRig:
             )
         names = [self.model.joint(i).name for i in range(self.model.njnt)]
         self._place = np.array([names.index(name) for name in robot.joint_names])
+        self.trees = self.model.dof_treeid[self._place]
+        """Number of each joint's kinematic tree, (J,): joints of different legs do not feel each other."""
         self._datas = [mujoco.MjData(self.model) for _ in range(max(threads, 1))]
         self._rollout = rollout.Rollout(nthread=threads if threads > 1 else 0)
 
