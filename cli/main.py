@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from .command_help import Program
-from .commands import judging, learning, using
+from .commands import judging, learning, measuring, using
 from .errors import check_folder, output_failures
 
 app = typer.Typer(
@@ -19,7 +19,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for group in (judging, learning, using):
+for group in (judging, measuring, learning, using):
     app.add_typer(group.app)
 
 

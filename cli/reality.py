@@ -7,9 +7,10 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from ..studies.reality.identifying import identify_robot
 from ..studies.reality.page import UNITS
 from ..studies.reality.replaying import label_of, replay
-from ..studies.reality.request import ReplayRequest
+from ..studies.reality.request import IdentifyRequest, ReplayRequest
 from .console import Terminal, make_table, print_json
 from .progress import ProgressDisplay
 from .studies import own_folder
@@ -19,6 +20,14 @@ def run_replay(request: ReplayRequest, *, out: Path | None, json_output: bool) -
     """Replay logs, print a table for each and where the files are."""
     folder = out or Path("results") / f"replay-{_names(request.logs)}"
     _make("replay", replay, print_replay, request, folder, json_output)
+
+
+def run_identify(request: IdentifyRequest, *, out: Path | None, json_output: bool) -> None:
+    """Identify a robot, print its constants, what the logs do not tell, and residuals beside nominal ones."""
+    folder = out or Path("results") / f"identify-{_names(request.logs)}"
+    _make("identify", identify_robot, print_identified, request, folder, json_output)
+    if not json_output:
+        Terminal().say(f"set      {folder / request.name}.toml")
 
 
 def _make(
@@ -78,3 +87,37 @@ def print_replay(console: Terminal, results: Mapping[str, Any]) -> None:
                     f"floor: {log['floor']['of']}", *(part for f in floors for part in (f"{scale * f:.2g}", ""))
                 )
             console.print(table)
+
+
+def print_identified(console: Terminal, results: Mapping[str, Any]) -> None:
+    """Print the constants with their intervals, and each log's residuals as shares of the nominal set's."""
+    table = make_table(
+        f"{results['robot']}: identified from base set {results['base']}",
+        "constant",
+        "nominal",
+        "identified",
+        "95 % interval",
+        "",
+        numbers=True,
+    )
+    for entry in results["unknowns"]:
+        low, high = entry["interval"]
+        told = (
+            (f"{entry['value']:.4g}", f"{low:.4g} to {high:.4g}", entry["unit"])
+            if entry["known"]
+            else ("not told", "", "")
+        )
+        table.add_row(entry["label"], f"{entry['nominal']:.4g}", *told)
+    console.print(table)
+    groups = list(results["logs"][0]["ratios"])
+    table = make_table(
+        "RMS difference, nominal = 1", "log", "delay [ms]", *groups, *(f"{g} torque" for g in groups), numbers=True
+    )
+    for log in results["logs"]:
+        for words, entry in ((log["name"], log), ("  judged on it, fitted on the others", log.get("held_out"))):
+            if entry is not None:
+                cells = [entry["ratios"][g].get(q) for q in ("position", "torque") for g in groups]
+                table.add_row(words, f"{1e3 * entry['delay']:.1f}", *("" if c is None else f"{c:.2f}" for c in cells))
+    console.print(table)
+    for note in results["notes"]:
+        console.say(note)

@@ -1,4 +1,4 @@
-"""Commands that judge and study: evaluate, compare, verify, board, validate, jury, consistency, trial, latent, replay."""
+"""Commands that judge and study: evaluate, compare, verify, board, validate, jury, consistency, trial, latent."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from ...gauge.request import EvaluationOptions, Request
 from ...studies.consistency.request import StudyRequest
 from ...studies.jury.request import JuryRequest
 from ...studies.latent.request import LatentRequest
-from ...studies.reality.request import ReplayRequest
 from ...studies.trials.request import TrialRequest
 from ..errors import UserError
 from ..requests import Tables, VerifyRequest, output, resume
@@ -188,20 +187,3 @@ def latent(
     from ..latent import run_latent
 
     run_latent(request, out=out, json_output=json_output)
-
-
-@command(app)
-def replay(
-    request: ReplayRequest,
-    out: Annotated[Path | None, output("results/replay-<log>")] = None,
-    json_output: Tables = False,
-) -> None:
-    """Play a real robot's log again in simulation and measure the differences, by joint, in time and over frequency.
-
-    Examples:
-      gaitgauge replay chirp.npz --robot go2
-      gaitgauge replay chirp.npz --parameters gauge --parameters identified.toml --fit-delay
-    """
-    from ..reality import run_replay
-
-    run_replay(request, out=out, json_output=json_output)

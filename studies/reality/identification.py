@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ...robots import JointParameters
 from .log import Array, Log, LogError
-from .residuals import BLOCK, SETTLING, Squares, differences, interval, joint_groups
+from .residuals import BLOCK, SETTLING, Squares, differences, joint_groups
 from .rig import FixedRig, Motion, acting_parameters, at_rows, beginning, held_targets, num_steps
 
 _ROWS_PER_SECOND = 100.0
@@ -437,6 +437,3 @@ def held_out_ratios(log: Log, nominal: Motion, found: Motion) -> dict[str, dict[
         for group, joints in groups.items():
             result[group][quantity] = above.rms(joints) / max(below.rms(joints), 1e-12)
     return result
-
-
-__all__ = ["KINDS", "Fit", "Unknown", "held_out_ratios", "identify", "interval"]

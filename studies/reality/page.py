@@ -26,6 +26,11 @@ def render_page(results: Mapping[str, Any], pictures: Sequence[Any]) -> str:
     return template.render(results=results, pictures=pictures, bands=BANDS, units=UNITS)
 
 
+def render_identified(results: Mapping[str, Any]) -> str:
+    """Return the page of an identification as HTML text."""
+    return page_template(__file__, "identify.html.j2", number=_number).render(results=results)
+
+
 def _scaled(value: float, quantity: str) -> str:
     return _number(value * UNITS[quantity][1])
 

@@ -1,0 +1,48 @@
+"""Commands that read logs of real robots: replay, identify, preflight."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ...studies.reality.request import IdentifyRequest, ReplayRequest
+from ..requests import Tables, output
+from ..running import command
+
+app = typer.Typer()
+
+
+@command(app)
+def replay(
+    request: ReplayRequest,
+    out: Annotated[Path | None, output("results/replay-<log>")] = None,
+    json_output: Tables = False,
+) -> None:
+    """Play a real robot's log again in simulation and measure the differences, by joint, in time and over frequency.
+
+    Examples:
+      gaitgauge replay chirp.npz --robot go2
+      gaitgauge replay chirp.npz --parameters gauge --parameters identified.toml --fit-delay
+    """
+    from ..reality import run_replay
+
+    run_replay(request, out=out, json_output=json_output)
+
+
+@command(app)
+def identify(
+    request: IdentifyRequest,
+    out: Annotated[Path | None, output("results/identify-<log>")] = None,
+    json_output: Tables = False,
+) -> None:
+    """Identify a robot from logs of it hung up: rotor inertia, friction, gains, delay, offsets, with intervals.
+
+    Examples:
+      gaitgauge identify chirp-kd1.npz chirp-kd3.npz --held-out --out identified
+      gaitgauge replay other.npz --parameters gauge --parameters identified/identified.toml
+    """
+    from ..reality import run_identify
+
+    run_identify(request, out=out, json_output=json_output)
