@@ -116,16 +116,18 @@ class _Problem:
 
     def _layout(self) -> None:
         """Number the residuals: block of time, joint, log and quantity of each."""
-        block, joint, part = [], [], []
+        block: list[NDArray[np.int64]] = []
+        joint: list[NDArray[np.int64]] = []
+        part: list[NDArray[np.int64]] = []
         first = 0
-        for log, rows in zip(self.logs, self.rows, strict=True):
+        for index, (log, rows) in enumerate(zip(self.logs, self.rows, strict=True)):
             time = log.time[rows]
             number = first + (time / BLOCK).astype(np.int64)
             first = int(number.max()) + 1
             for quantity in range(2 if log.torque is not None else 1):
                 block.append(np.repeat(number, self.robot.num_joints))
                 joint.append(np.tile(np.arange(self.robot.num_joints), len(rows)))
-                part.append(np.full(block[-1].shape, 2 * len(part) + quantity))
+                part.append(np.full(block[-1].shape, 2 * index + quantity))
         self.block, self.joint, self.part = (np.concatenate(x) for x in (block, joint, part))
 
     def _nominal_scale(self, residual: Array) -> Array:
@@ -162,7 +164,7 @@ class _Problem:
         """Return a guess as a set."""
         found = self.constants(x)
         delays = [v for u, v in zip(self.unknowns, x, strict=True) if u.key == "delay"]
-        values = {key: tuple(float(v) for v in found[key]) for key in KINDS}
+        values: dict[str, Any] = {key: tuple(float(v) for v in found[key]) for key in KINDS}
         return replace(self.base, **values, delay=float(np.mean(delays)))
 
     def simulate(self, guesses: Array, number: int, *, nominal: bool = False) -> Array:
@@ -172,7 +174,7 @@ class _Problem:
         position, velocity = self.starts[number]
         for x in guesses:
             found = self.constants(x, number)
-            values = {key: tuple(found[key].tolist()) for key in KINDS}
+            values: dict[str, Any] = {key: tuple(found[key].tolist()) for key in KINDS}
             sets.append(acting_parameters(log, self.base if nominal else replace(self.base, **values)))
             delay = 0.0 if nominal else float(found["delay"][0])
             if delay not in held:
