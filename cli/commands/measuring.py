@@ -40,8 +40,8 @@ def identify(
     """Identify a robot from logs of it hung up: rotor inertia, friction, gains, delay, offsets, with intervals.
 
     Examples:
+      gaitgauge identify chirp.npz --robot go2
       gaitgauge identify chirp-kd1.npz chirp-kd3.npz --held-out --out identified
-      gaitgauge replay other.npz --parameters gauge --parameters identified/identified.toml
     """
     from ..reality import run_identify
 
