@@ -25,6 +25,12 @@ from .console import Terminal, make_table, print_json
 from .progress import ProgressDisplay, duration
 from .studies import resumable
 
+SLOWER = (
+    "the suite commands more than the policy was made for; 'gaitgauge play POLICY' stays within its limits, and a suite with "
+    'commands.beyond = "clip" plays it there'
+)
+"""Advice for a policy that falls where more is commanded than it was made for."""
+
 
 def run_evaluation(request: Request, *, out: Path | None, resume: bool, clip: bool, json_output: bool) -> None:
     """Evaluate, show progress, film the robot, print the tables and where the files are."""
@@ -52,13 +58,14 @@ def run_evaluation(request: Request, *, out: Path | None, resume: bool, clip: bo
         return
     console = Terminal()
     print_results(console, result)
-    if sentence := doubtful_assumptions(prepared.policy.contract, prepared.suite, folder):
+    within = not result.commands.beyond
+    if sentence := doubtful_assumptions(prepared.policy.contract, prepared.suite, folder, within=within):
         console.say(sentence)
     console.say(f"results  {folder / 'results.json'}\nepisodes {folder / 'episodes.csv'}\nreport   {report}")
 
 
-def doubtful_assumptions(contract: PolicyContract, suite: Suite, folder: Path) -> str | None:
-    """Return advice where the robot fell at once in most episodes."""
+def doubtful_assumptions(contract: PolicyContract, suite: Suite, folder: Path, *, within: bool = True) -> str | None:
+    """Return advice where the robot fell at once in most episodes; ``within``: all commands were within the policy's limits."""
     at_once = AT_ONCE + suite.settling.longest
     with (folder / "episodes.csv").open(encoding="utf-8", newline="") as file:
         whole = [row for row in csv.DictReader(file) if row["command"] == ALL]
@@ -66,7 +73,8 @@ def doubtful_assumptions(contract: PolicyContract, suite: Suite, folder: Path) -
     fell = [falls > 0 and steps * contract.control_period <= falls * at_once for falls, steps in counts]
     if 2 * sum(fell) <= len(fell):
         return None
-    return f"the robot fell at once in {sum(fell)} of {len(fell)} episodes: {doubt(contract)}"
+    advice = doubt(contract) if within else SLOWER
+    return f"the robot fell at once in {sum(fell)} of {len(fell)} episodes: {advice}"
 
 
 def shower(display: ProgressDisplay) -> Callable[[Status], None]:

@@ -9,6 +9,7 @@ from ..policy.contract import PRIVILEGED_TERMS
 from .pipelines import Environment, make_environments
 from .result import COMPLETE, CUSTOM, PART, UNKNOWN, AxisCoverage, Coverage, Result
 from .suite import Suite
+from .suited import beyond_in_words, changes
 
 _AXES = {"terrains": "terrain", "frictions": "friction", "payloads": "payload", "seeds": "seed"}
 """Axes of a suite's matrix, and one entry of each in words."""
@@ -44,6 +45,7 @@ def coverage(
     foreign = [f"{_AXES[at]} {_listed(e.foreign)}{units.get(at, '')}" for at, e in axes.items() if e.foreign]
     if levels:
         foreign.append(f"level {_listed(levels)} given, not searched for")
+    foreign += changes(suite)
     if not foreign and found - wanted:
         foreign.append("pairs of friction and payload that the suite does not have")
     parts = [
@@ -92,6 +94,7 @@ def notes(result: Result) -> list[str]:
     if result.policy.kind_of_observations == "privileged":
         terms = ", ".join(t for t in result.policy.observations or () if t in PRIVILEGED_TERMS)
         found.append(f"privileged observations: no sensor of a robot measures {terms}")
+    found += [s] if (s := beyond_in_words(result.commands.limits, result.commands.beyond)) else []
     return found + ([result.motors.note] if result.motors.note else [])
 
 

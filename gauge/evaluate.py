@@ -48,6 +48,7 @@ from .result import ClusterName, Motors, PolicyName, Provenance, Result
 from .results import fold, rows_csv
 from .store import RunFolder, StoreError
 from .suite import Suite, SuiteError, load_suite
+from .suited import shares_beyond, suited
 from .totals import health_of
 
 _WORLDS = 24
@@ -131,6 +132,7 @@ def prepare(request: Request) -> Prepared:
     asked = None if request.robot is None else load_robot(request.robot)
     policy = load_policy(request.policy, asked, trust=request.trust, contract_file=request.contract)
     robot = robot_for(policy.contract, request.robot)
+    suite = suited(suite, policy.contract)
     check_fit(suite, robot, policy.contract)
     return Prepared(
         request=request,
@@ -242,6 +244,7 @@ def evaluate(
         contract, engine = prepared.policy.contract, find_backend(request.backend, prepared.device)
         digests = {"policy": prepared.policy.digest, "robot": robot_digest(prepared.robot)}
         digests |= {"suite": suite.digest, "source": source_digest()}
+        beyond = shares_beyond(suite, {e.terrain for e in prepared.environments}, contract.command_limits)
         motors, note = joint_parameters(suite, prepared.robot, contract), gains_note(suite, prepared.robot, contract)
         result = Result(
             **vars(scores),
@@ -260,7 +263,7 @@ def evaluate(
             robot=prepared.robot.name,
             motors=Motors(stiffness=motors.stiffness, damping=motors.damping, note=note),
             training=training_physics(contract),
-            commands=command_shares(contract),
+            commands=command_shares(contract, beyond),
             feet=played_feet(suite, prepared.robot, engine),
             health=health_of(scores.environments),
             solver=dict(engine.solver_settings(suite.physics)),

@@ -107,6 +107,10 @@ class Commands:
     clock_offset: Annotated[float, Field(ge=0.0, lt=1.0)]
     """Part of a control period by which the goal clock is read early: with 0 a phase ends, and the next sub-command shows,
     one step too soon (the reference); with 0.5 phases have their exact length."""
+    beyond: Literal["published", "clip", "scale"] = "published"
+    """What becomes of commands beyond a policy's limits: ``published``: they stay, and the result says how many there are;
+    ``clip``: they end at the limits, and the result is custom; ``scale``: limits and target speeds above are shares of the
+    policy's own limits."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -234,10 +238,14 @@ class Suite:
     """Policies with other gains than ``gains = "suite"`` gives; the first family that fits a contract counts."""
     push: Push | None = None
     """None: nothing pushes."""
+    written: Suite | None = None
+    """The suite as it is written, where this one was suited to a policy (``suited.suited``); no rule of a suite file."""
 
     @property
     def digest(self) -> str:
         """Return the SHA-256 over every rule, hexadecimal: two suites of one name and different rules differ in it."""
+        if self.written is not None:
+            return self.written.digest
         rules = asdict(self)
         for goal in rules["goals"]:
             if not goal["sub_commands"]:
@@ -269,6 +277,8 @@ _ADDED: Mapping[str, Any] = {
     "gains": "suite",
     "families": (),
     "push": None,
+    "commands.beyond": "published",
+    "written": None,
 }
 """Rules that came after suites had been published, and the values that say what held before."""
 
@@ -341,6 +351,12 @@ def _tables(name: str, behind: tuple[Path, ...]) -> tuple[Path, dict[str, Any]]:
 _LONGEST_CHAIN = 10
 
 
+def _shares(suite: Suite) -> tuple[float, ...]:
+    """Return the numbers of a suite's commands that ``scale`` takes as shares."""
+    commands = suite.commands
+    return (*commands.flat, *commands.levelled, *commands.target_speed.values())
+
+
 def _goal_rules(suite: Suite) -> dict[str, bool]:
     """Return sentences on goals, each with True if the rule is kept."""
     paper, goals = get_args(GoalName), [g.name for g in suite.goals]
@@ -405,6 +421,11 @@ def _check(suite: Suite, source: str) -> None:
         f"scoring.level is 'area', and episodes need noise of their own; noise.stream is '{suite.noise.stream}', let it be "
         "'counter', or let scoring.level be 'bisection'"
     ] = scoring.level != "area" or suite.noise.stream == "counter"
+    rules["written is no rule of a suite file; leave it out"] = suite.written is None
+    largest = max(_shares(suite))
+    rules[
+        f"commands.beyond is 'scale', which takes limits and target speeds as shares of a policy's limits; {largest:g} is above 1"
+    ] = suite.commands.beyond != "scale" or largest <= 1.0
     rules |= _goal_rules(suite)
     if (push := suite.push) is not None:
         rules[f"push.after ({push.after[0]:g} to {push.after[1]:g} s) must rise"] = push.after[0] <= push.after[1]

@@ -44,7 +44,7 @@ def assumptions(contract: PolicyContract) -> str | None:
     """Return the assumptions about a policy that lacks a contract, or parts of one, as one sentence; None where there are none."""
     if "assumed" not in contract.provenance:
         return None
-    if contract.provenance["adapter"] not in GUESSES:
+    if contract.provenance.get("adapter", GUESSES[0]) not in GUESSES:
         return f"assumed: {contract.provenance['assumed']}"
     scales = ", ".join(f"{t.name} × {', '.join(f'{s:g}' for s in t.scale)}" for t in contract.observation)
     joints = ", ".join(name.removesuffix("_joint") for name in contract.joint_names)

@@ -117,3 +117,5 @@ def test_assumptions_are_repeated_where_the_robot_falls_at_once(tmp_path, contra
     assert said(guessed, (1, 4000)) is None  # it fell late
     assert "gaitgauge doctor" in said(contract, falling)
     assert "taken for granted" not in said(contract, falling)  # nothing was guessed
+    asked = doubtful_assumptions(guessed, suite, tmp_path, within=False)
+    assert "commands more than the policy was made for" in asked and "doctor" not in asked
