@@ -92,6 +92,15 @@ _OWN: dict[str, _Own] = {
         terms=f"BSD-3-Clause; {_MOSEK}",
         extra="drake",
     ),
+    "physx": _Own(
+        place=".physx.backend:PhysxBackend",
+        device="CPU",
+        packages=("ovphysx", "ovstage", "physx_usd_schemas"),
+        note="NVIDIA PhysX by ovphysx, float32; an independent judge",
+        distributions=("ovphysx", "ovstage"),
+        terms="proprietary: NVIDIA Omniverse licence (ovphysx), NVIDIA's own (ovstage)",
+        extra="physx",
+    ),
 }
 
 

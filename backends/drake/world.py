@@ -10,7 +10,8 @@ from pydrake.geometry import GeometryId, ProximityProperties, RoleAssign
 from pydrake.multibody.plant import CoulombFriction
 from pydrake.systems.analysis import Simulator
 
-from ..sequential import Base, Contacts, RobotModel, World
+from ..sequential import Base, Contact, RobotModel, World
+from ..sequential.rotation import matrix
 from ..sequential.world import Array
 from .hydroelastic import deepest, mean_normal
 from .plant import Plant, spatial_inertia
@@ -34,7 +35,6 @@ class DrakeWorld(World):
         base = built.bodies[0]
         self._base_q = base.floating_positions_start()
         self._base_v = base.floating_velocities_start_in_v()
-        self._foot_shapes = [robot.foot(i) for i in range(max(shape.foot for shape in robot.shapes) + 1)]
         self._center = robot.links[0].center
         self._friction = robot.foot_friction
         self._q = plant.GetPositions(self._context)
@@ -42,7 +42,7 @@ class DrakeWorld(World):
 
     def place(self, base: Base, joint_position: Array, joint_velocity: Array) -> None:
         """See ``World.place``."""
-        q, v, turn = self._q.copy(), self._v.copy(), rotation(base.quaternion)
+        q, v, turn = self._q.copy(), self._v.copy(), matrix(base.quaternion)
         q[self._base_q : self._base_q + 4], q[self._base_q + 4 : self._base_q + 7] = base.quaternion, base.position
         v[self._base_v : self._base_v + 3] = turn @ base.angular_velocity
         v[self._base_v + 3 : self._base_v + 6] = base.linear_velocity
@@ -59,7 +59,7 @@ class DrakeWorld(World):
         applied = np.zeros(len(self._v))
         applied[self._built.joint_v] = torque
         if force_w.any():
-            arm = rotation(self._q[self._base_q : self._base_q + 4]) @ self._center
+            arm = matrix(self._q[self._base_q : self._base_q + 4]) @ self._center
             applied[self._base_v : self._base_v + 3] = np.cross(arm, force_w)
             applied[self._base_v + 3 : self._base_v + 6] = force_w
         self._forces.GetMutableData().set_value(applied)
@@ -79,13 +79,13 @@ class DrakeWorld(World):
             position=q[4:7],
             quaternion=q[0:4] / np.linalg.norm(q[0:4]),
             linear_velocity=v[3:6],
-            angular_velocity=rotation(q[0:4]).T @ v[0:3],
+            angular_velocity=matrix(q[0:4]).T @ v[0:3],
         )
 
     def feet(self) -> tuple[Array, Array]:
         """See ``World.feet``."""
         plant, positions, velocities = self._built.plant, [], []
-        for shape in self._foot_shapes:
+        for shape in self._robot.feet:
             body = self._built.bodies[shape.link]
             place = plant.EvalBodyPoseInWorld(self._context, body)
             motion = plant.EvalBodySpatialVelocityInWorld(self._context, body)
@@ -94,51 +94,34 @@ class DrakeWorld(World):
             velocities.append(motion.translational() + np.cross(motion.rotational(), arm))
         return np.array(positions), np.array(velocities)
 
-    def contacts(self) -> Contacts:
+    def contacts(self) -> list[Contact]:
         """See ``World.contacts``."""
         results, shape_of, terrain = self._results.Eval(self._context), self._built.shape_of, self._built.terrain
-        rows: list[tuple[Any, ...]] = []
+        found: list[Contact] = []
 
-        def keep(mine: GeometryId, other: GeometryId, force: Array, moment: Array, **found: Any) -> None:
-            if mine in shape_of and other in terrain:  # else two shapes of the robot
-                rows.append(
-                    (
-                        shape_of[mine],
-                        force,
-                        force @ found["normal"],
-                        found["point"],
-                        moment,
-                        found["depth"],
-                        terrain[other],
-                    )
-                )
+        def keep(mine: GeometryId, other: GeometryId, force: Array, normal: Array, **more: Any) -> None:
+            along = float(force @ normal)
+            across = float(np.linalg.norm(force - along * normal))
+            of = {"shape": shape_of[mine], "terrain": terrain[other]}
+            found.append(Contact(**of, force_w=force, normal=along, tangential=across, **more))
 
         for i in range(results.num_point_pair_contacts()):
             info = results.point_pair_contact_info(i)
-            pair, on_b, zero = info.point_pair(), info.contact_force(), np.zeros(3)
-            found = {"point": info.contact_point(), "depth": pair.depth}
-            keep(pair.id_B, pair.id_A, on_b, zero, normal=-pair.nhat_BA_W, **found)
-            keep(pair.id_A, pair.id_B, -on_b, zero, normal=pair.nhat_BA_W, **found)
+            pair, on_b = info.point_pair(), info.contact_force()
+            more = {"point_w": info.contact_point(), "depth": pair.depth}
+            if pair.id_B in shape_of and pair.id_A in terrain:
+                keep(pair.id_B, pair.id_A, on_b, -pair.nhat_BA_W, **more)
+            elif pair.id_A in shape_of and pair.id_B in terrain:
+                keep(pair.id_A, pair.id_B, -on_b, pair.nhat_BA_W, **more)
         for i in range(results.num_hydroelastic_contacts()):
             info = results.hydroelastic_contact_info(i)
-            surface, on_m, normal = info.contact_surface(), info.F_Ac_W(), mean_normal(info.contact_surface())
-            force, moment = on_m.translational(), on_m.rotational()
+            surface, on_m = info.contact_surface(), info.F_Ac_W()
             for mine, other, sign in ((surface.id_M(), surface.id_N(), 1.0), (surface.id_N(), surface.id_M(), -1.0)):
                 if mine in shape_of and other in terrain:
-                    found = {"point": surface.centroid(), "depth": deepest(surface, self._robot.shapes[shape_of[mine]])}
-                    keep(mine, other, sign * force, sign * moment, normal=sign * normal, **found)
-        shape, force_w, normal_force, point, moment_w, depth, on_terrain = (
-            zip(*rows, strict=True) if rows else ((),) * 7
-        )
-        return Contacts(
-            shape=np.array(shape, dtype=np.int64),
-            force_w=np.reshape(force_w, (-1, 3)),
-            normal=np.array(normal_force),
-            point_w=np.reshape(point, (-1, 3)),
-            moment_w=np.reshape(moment_w, (-1, 3)),
-            depth=np.array(depth),
-            terrain=np.array(on_terrain, dtype=np.bool_),
-        )
+                    more = {"point_w": surface.centroid(), "moment_w": sign * on_m.rotational()}
+                    depth = deepest(surface, self._robot.shapes[shape_of[mine]])
+                    keep(mine, other, sign * on_m.translational(), sign * mean_normal(surface), depth=depth, **more)
+        return found
 
     def change(self, changes: Mapping[str, Array]) -> None:
         """See ``World.change``."""
@@ -159,8 +142,7 @@ class DrakeWorld(World):
         """See ``World.constants``."""
         built, plant = self._built, self._built.plant
         inertias = [body.CalcSpatialInertiaInBodyFrame(self._context) for body in built.bodies]
-        places = {link.collision_body: i for i, link in enumerate(self._robot.links) if link.collision_body >= 0}
-        chosen = [inertias[places[i]] for i in range(len(places))]
+        chosen = [inertias[i] for i in self._robot.collision_links]
         joints = [plant.get_joint_actuator(index).joint() for index in plant.GetJointActuatorIndices()]
         order = np.argsort([np.flatnonzero(built.joint_v == joint.velocity_start())[0] for joint in joints])
         inspector = built.scene_graph.get_query_output_port().Eval(self._sources).inspector()
@@ -184,18 +166,6 @@ class DrakeWorld(World):
                 plant.get_joint_actuator(plant.GetJointActuatorIndices()[i]).rotor_inertia(self._context) for i in order
             ],
             "joint_damping": [joints[i].GetDamping(self._context) for i in order],
-            "foot_friction": [friction(feet[i]) for i in range(len(self._foot_shapes))],
+            "foot_friction": [friction(feet[i]) for i in range(len(self._robot.feet))],
             "floor_friction": friction(next(iter(built.terrain))),
         }
-
-
-def rotation(quaternion: Array) -> Array:
-    """Return the matrix (3, 3) of a quaternion wxyz of any length."""
-    w, x, y, z = quaternion / np.linalg.norm(quaternion)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )

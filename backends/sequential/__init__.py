@@ -2,6 +2,6 @@
 
 from .backend import SequentialBackend
 from .robot import Link, RobotModel, Shape, read_robot
-from .world import Base, Contacts, World
+from .world import Base, Contact, World
 
-__all__ = ["Base", "Contacts", "Link", "RobotModel", "SequentialBackend", "Shape", "World", "read_robot"]
+__all__ = ["Base", "Contact", "Link", "RobotModel", "SequentialBackend", "Shape", "World", "read_robot"]

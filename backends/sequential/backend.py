@@ -52,6 +52,8 @@ class SequentialBackend(PhysicsBackend):
     """
 
     parallel_processes: ClassVar[bool] = True
+    precision: ClassVar[torch.dtype] = torch.float64
+    """Floating-point type of the engine."""
     limits: ClassVar[Mapping[str, Capability]]
     """Capabilities that are not exact."""
     own_dry_friction: ClassVar[bool]
@@ -68,7 +70,7 @@ class SequentialBackend(PhysicsBackend):
 
     def __init__(self, scene: Scene, *, device: str = "cpu", threads: int = 1) -> None:
         self.device = find_device(device, self.name, gpu=False)
-        self.scene, self.dtype = scene, torch.float64
+        self.scene, self.dtype = scene, self.precision
         self._refuse()
         n, joints, physics = scene.num_worlds, scene.robot.num_joints, scene.physics
         self.robot: RobotModel = read_robot(scene)
@@ -82,9 +84,8 @@ class SequentialBackend(PhysicsBackend):
         tilt = physics.watch_tilt
         self._tilt_bound = np.inf if tilt is None else 0.5 * (1.0 - np.cos(tilt))
         self._deep = np.inf if physics.watch_penetration is None else physics.watch_penetration
-        self._foot_of = np.array([shape.foot for shape in self.robot.shapes])
-        self._body_of = np.array([self.robot.links[shape.link].collision_body for shape in self.robot.shapes])
-        self._trunk = np.array([shape.trunk for shape in self.robot.shapes])
+        self._foot_of = [shape.foot for shape in self.robot.shapes]
+        self._body_of = [self.robot.links[shape.link].collision_body for shape in self.robot.shapes]
         self.engine_seconds = 0.0
         self._state, self._now = self._allocate()
         self._sample, self._then = self._allocate()
@@ -124,9 +125,10 @@ class SequentialBackend(PhysicsBackend):
         shapes |= dict.fromkeys(("foot_position_w", "foot_velocity_w", "foot_contact_force_w"), (f, 3))
         shapes |= dict.fromkeys(("foot_normal_force", "foot_tangential_force"), (f,))
         arrays: dict[str, NDArray[Any]] = {}
+        real = np.float32 if self.precision is torch.float32 else np.float64
         for item in fields(PhysicsState):
             row = shapes.get(item.name, (3,) if item.name.endswith(("_w", "_b")) else ())
-            arrays[item.name] = np.zeros((n, *row), dtype=_KINDS.get(item.name, np.float64))
+            arrays[item.name] = np.zeros((n, *row), dtype=_KINDS.get(item.name, real))
         return PhysicsState(**{name: torch.from_numpy(array) for name, array in arrays.items()}), arrays
 
     @property
@@ -199,14 +201,17 @@ class SequentialBackend(PhysicsBackend):
             late = 0 if delay is None else int(delay[row])
             wanted = 0 if sample_at is None else int(sample_at[row])
             now["tilt_substep"][row] = now["penetration_substep"][row] = 0
+            now["diverged"][row] |= not self._finite(row)
             for substep in range(1, count + 1):
                 if targets is not None and substep == late + 1:
                     self._target[row], self._limp[row] = targets[row], False
                 self._substep(row)
                 self._watch(row, substep)
                 if substep == wanted:
+                    now["diverged"][row] |= not self._finite(row)
                     self._read_contacts(row, self._then)
                     self._read_motion(row, self._then)
+            now["diverged"][row] |= not self._finite(row)
             if targets is not None and late >= count:
                 self._target[row], self._limp[row] = targets[row], False
             self._read_contacts(row, now)
@@ -238,21 +243,20 @@ class SequentialBackend(PhysicsBackend):
             torque = torque - np.clip(self.robot.friction_slope * velocity, -self._dry, self._dry)
         began = perf_counter()
         try:
-            sound = self._finite(row, torque)
+            sound = bool(np.isfinite(torque).all())
             if sound:
                 world.step(torque, self._force[row])
-                sound = self._finite(row)
         except RuntimeError:  # the engine's own alarm
             sound = False
         self.engine_seconds = (self.engine_seconds or 0.0) + perf_counter() - began
         now["diverged"][row] = not sound
 
-    def _finite(self, row: int, torque: Array | None = None) -> bool:
-        """Return whether a world's motion, and torques that are to act, are finite."""
+    def _finite(self, row: int) -> bool:
+        """Return whether a world's motion is finite."""
         world = self._worlds[row]
         base = world.base()
         every = (*world.joints(), base.position, base.quaternion, base.linear_velocity, base.angular_velocity)
-        return all(np.isfinite(values).all() for values in (every if torque is None else (*every, torque)))
+        return all(np.isfinite(values).all() for values in every)
 
     def _watch(self, row: int, substep: int) -> None:
         """Record the first substep beyond each watched limit."""
@@ -261,8 +265,8 @@ class SequentialBackend(PhysicsBackend):
             _, x, y, _ = self._worlds[row].base().quaternion
             now["tilt_substep"][row] = substep * (x * x + y * y > self._tilt_bound)
         if self._deep < np.inf and not now["penetration_substep"][row] and not now["diverged"][row]:
-            found = self._worlds[row].contacts()
-            now["penetration_substep"][row] = substep * bool((found.depth[found.terrain] > self._deep).any())
+            deepest = max((each.depth for each in self._worlds[row].contacts() if each.terrain), default=0.0)
+            now["penetration_substep"][row] = substep * (deepest > self._deep)
 
     def _read_motion(self, row: int, out: dict[str, NDArray[Any]]) -> None:
         """Write poses, velocities and flags of a world."""
@@ -284,24 +288,23 @@ class SequentialBackend(PhysicsBackend):
         if self._now["diverged"][row]:
             return
         found = self._worlds[row].contacts()
-        foot, body, trunk = (of[found.shape] for of in (self._foot_of, self._body_of, self._trunk))
-        across = np.sqrt(np.maximum((found.force_w**2).sum(1) - found.normal**2, 0.0))
-        for name, value in (
-            ("contact_force_w", found.force_w),
-            ("normal_force", found.normal),
-            ("tangential_force", across),
-        ):
-            np.add.at(out[f"foot_{name}"][row], foot[foot >= 0], value[foot >= 0])
-        others = (foot < 0) & (body >= 0)
-        np.add.at(out["body_contact_force_w"][row], body[others], found.force_w[others])
-        out["trunk_contact_force_w"][row] = found.force_w[trunk].sum(0)
-        active = found.normal > 0.0
-        if active.any():
-            center = found.point_w[active].mean(0)
-            arms = np.cross(found.point_w - center, found.force_w)
-            out["contact_center_w"][row], out["contact_count"][row] = center, active.sum()
-            out["ground_force_w"][row] = found.force_w.sum(0)
-            out["ground_moment_w"][row] = (arms + found.moment_w).sum(0)
+        for each in found:
+            foot, body = self._foot_of[each.shape], self._body_of[each.shape]
+            if foot >= 0:
+                out["foot_contact_force_w"][row, foot] += each.force_w
+                out["foot_normal_force"][row, foot] += each.normal
+                out["foot_tangential_force"][row, foot] += each.tangential
+            elif body >= 0:
+                out["body_contact_force_w"][row, body] += each.force_w
+            if self.robot.shapes[each.shape].trunk:
+                out["trunk_contact_force_w"][row] += each.force_w
+            out["ground_force_w"][row] += each.force_w
+        points = [each.point_w for each in found if each.normal > 0.0]
+        if points:
+            center = np.mean(points, axis=0)
+            out["contact_center_w"][row], out["contact_count"][row] = center, len(points)
+            moments = [np.cross(each.point_w - center, each.force_w) + each.moment_w for each in found]
+            out["ground_moment_w"][row] = np.sum(moments, axis=0)
 
     def randomize(self, randomization: Randomization, worlds: torch.Tensor | None = None) -> None:
         """See ``PhysicsBackend.randomize``."""

@@ -71,6 +71,8 @@ class Link:
     """Of the hinge [m], (3,)."""
     limits: tuple[float, float]
     """[rad]; infinite for none."""
+    standing: tuple[Array, Array]
+    """Position [m] and quaternion wxyz in the default pose, the base at the origin."""
     collision_body: int
     """Index in ``Robot.collision_bodies``, -1 for none."""
 
@@ -88,9 +90,16 @@ class RobotModel:
     friction_slope: Array
     """Of ``dry_friction_slope`` [N·m·s/rad], (J,)."""
 
-    def foot(self, index: int) -> Shape:
-        """Return the shape of a foot."""
-        return next(shape for shape in self.shapes if shape.foot == index)
+    @property
+    def feet(self) -> list[Shape]:
+        """Return the shape of each foot."""
+        return sorted((shape for shape in self.shapes if shape.foot >= 0), key=lambda shape: shape.foot)
+
+    @property
+    def collision_links(self) -> list[int]:
+        """Return the link of each of ``Robot.collision_bodies``."""
+        found = {link.collision_body: index for index, link in enumerate(self.links)}
+        return [found[body] for body in range(max(found) + 1)]
 
     def inertias(self, changes: Mapping[str, Array]) -> list[tuple[float, Array, Array]]:
         """Return mass, centre and inertia of each link, as in ``Link``, after the changes of ``Randomization`` by name."""
@@ -114,7 +123,12 @@ def read_robot(scene: Scene) -> RobotModel:
     """
     robot, model = scene.robot, robot_spec(scene).compile()
     order = {model.joint(name).id: i for i, name in enumerate(robot.joint_names)}
-    links = tuple(_link(scene, model, body, order) for body in range(1, model.nbody))
+    data = mujoco.MjData(model)
+    data.qpos[:7] = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
+    for name, angle in zip(robot.joint_names, robot.default_joint_position, strict=True):
+        data.joint(name).qpos[0] = angle
+    mujoco.mj_kinematics(model, data)
+    links = tuple(_link(scene, model, data, body, order) for body in range(1, model.nbody))
     if links[0].name != robot.base_body:
         raise BackendError(f"body '{robot.base_body}' of robot '{robot.name}' must come first and carry the free joint")
     geoms = [g for g in range(model.ngeom) if model.geom_contype[g] or model.geom_conaffinity[g]]
@@ -129,7 +143,7 @@ def read_robot(scene: Scene) -> RobotModel:
     )
 
 
-def _link(scene: Scene, model: mujoco.MjModel, body: int, order: dict[int, int]) -> Link:
+def _link(scene: Scene, model: mujoco.MjModel, data: mujoco.MjData, body: int, order: dict[int, int]) -> Link:
     robot, joint, count = scene.robot, int(model.body_jntadr[body]), int(model.body_jntnum[body])
     name = model.body(body).name or f"body_{body}"
     hinge, axis, anchor, limits = -1, np.array([0.0, 0.0, 1.0]), np.zeros(3), (-np.inf, np.inf)
@@ -156,6 +170,7 @@ def _link(scene: Scene, model: mujoco.MjModel, body: int, order: dict[int, int])
         axis=axis,
         anchor=anchor,
         limits=limits,
+        standing=(data.xpos[body].copy(), data.xquat[body].copy()),
         collision_body=robot.collision_bodies.index(name) if name in robot.collision_bodies else -1,
     )
 

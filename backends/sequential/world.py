@@ -27,24 +27,29 @@ class Base:
     """Body frame [rad/s], (3,)."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Contacts:
-    """Contacts of the last physics step between the robot and the ground, K of them."""
+@dataclass(kw_only=True, eq=False, slots=True)
+class Contact:
+    """A contact of the last physics step between the robot and the ground.
 
-    shape: NDArray[np.int64]
-    """Index of the robot's shape, (K,)."""
-    force_w: Array
-    """Of the ground on the robot [N], (K, 3)."""
-    normal: Array
-    """Part of the force along the contact's own normal [N], (K,)."""
+    An engine may report pressure and friction of one contact apart, each with its part of the force.
+    """
+
+    shape: int
+    """Index of the robot's shape."""
+    terrain: bool
+    """True for boxes and height fields, False for the floor and walls."""
     point_w: Array
-    """[m], (K, 3)."""
-    moment_w: Array
-    """Moment of a contact area about its point [N·m], (K, 3); zero for a point."""
-    depth: Array
-    """[m], (K,)."""
-    terrain: NDArray[np.bool_]
-    """True for boxes and height fields, False for the floor and walls, (K,)."""
+    """[m], (3,)."""
+    force_w: Array
+    """Of the ground on the robot [N], (3,)."""
+    normal: float
+    """Part of the force along the contact's own normal [N]."""
+    tangential: float
+    """Magnitude of the rest of the force [N]."""
+    depth: float = 0.0
+    """[m]."""
+    moment_w: Array | float = 0.0
+    """Moment of a contact area about its point [N·m], (3,); zero for a point."""
 
 
 class World(ABC):
@@ -75,8 +80,8 @@ class World(ABC):
         """Return positions [m] and velocities [m/s] of the feet's centres in the world frame, (F, 3) each."""
 
     @abstractmethod
-    def contacts(self) -> Contacts:
-        """Return the contacts of the last physics step whose force is not zero, or that are deep."""
+    def contacts(self) -> list[Contact]:
+        """Return the contacts of the last physics step between the robot and the ground."""
 
     @abstractmethod
     def change(self, changes: Mapping[str, Array]) -> None:

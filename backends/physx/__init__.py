@@ -1,0 +1,1 @@
+"""NVIDIA PhysX on the CPU by ovphysx (extra ``[physx]``)."""
