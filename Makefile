@@ -3,11 +3,12 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
+JURY := build/jury-venv
 
 # Tests and guides start the package in many processes, which find it compiled.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: install demo test test-slow test-gpu cpp fuzz torture check docs docs-pages docs-site format clean
+.PHONY: install demo test test-slow test-gpu test-jury cpp fuzz torture check docs docs-pages docs-site format clean
 
 install: $(READY)
 
@@ -30,6 +31,17 @@ test-slow: install
 
 test-gpu: install
 	$(BIN)/python -m pytest -m gpu
+
+# The engines of the extras in an environment of their own, on top of $(VENV): ovphysx wants another `packaging` than pytest 9.
+test-jury: $(JURY)/.ready
+	$(JURY)/bin/python -m pytest -n auto tests/backends/test_independent_engines.py
+
+$(JURY)/.ready: $(READY)
+	$(PYTHON) -m venv $(JURY)
+	echo "import site; site.addsitedir('$$($(BIN)/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')')" \
+		> "$$($(JURY)/bin/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')/shared.pth"
+	$(JURY)/bin/python -m pip install --quiet 'pytest<9' --editable '.[drake,physx]'
+	touch $(JURY)/.ready
 
 # The C++ controller of examples/. Needs apt, cmake, a C++ compiler and libyaml-cpp-dev.
 cpp: install

@@ -103,8 +103,8 @@ class Reference:
         qvel[self.at_velocity] = joint_velocity
         mujoco.mj_forward(self.model, self.data)
 
-    def step(self, target: ArrayLike | None = None, *, substeps: int = 1) -> None:
-        """Integrate with the motor law evaluated at the start of each substep; None leaves the motors limp."""
+    def step(self, target: ArrayLike | None = None, *, substeps: int = 1, finer: int = 1) -> None:
+        """Integrate with the motor law evaluated at the start of each substep of ``finer`` steps; None leaves the motors limp."""
         kp, kd = np.asarray(self.parameters.stiffness), np.asarray(self.parameters.damping)
         for _ in range(substeps):
             if target is not None:
@@ -114,7 +114,7 @@ class Reference:
                 self.torque = np.zeros(self.robot.num_joints)
             self.data.qfrc_applied[self.at_velocity] = self.torque
             self.data.xfrc_applied[self.base, :3] = self.force_w
-            mujoco.mj_step(self.model, self.data)
+            mujoco.mj_step(self.model, self.data, finer)
         mujoco.mj_forward(self.model, self.data)
 
     @property

@@ -102,8 +102,8 @@ class DrakeWorld(World):
         def keep(mine: GeometryId, other: GeometryId, force: Array, normal: Array, **more: Any) -> None:
             along = float(force @ normal)
             across = float(np.linalg.norm(force - along * normal))
-            of = {"shape": shape_of[mine], "terrain": terrain[other]}
-            found.append(Contact(**of, force_w=force, normal=along, tangential=across, **more))
+            own = {"force_w": force, "normal": along, "tangential": across}
+            found.append(Contact(shape=shape_of[mine], terrain=terrain[other], **own, **more))  # type: ignore[arg-type]
 
         for i in range(results.num_point_pair_contacts()):
             info = results.point_pair_contact_info(i)

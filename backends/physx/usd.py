@@ -188,7 +188,7 @@ def _robot(usd: UsdText, scene: Scene, robot: RobotModel) -> None:
         schemas = ("PhysicsRigidBodyAPI", "PhysxRigidBodyAPI", "PhysicsMassAPI", "PhysxContactReportAPI", *root)
         usd.open("Xform", link_name(index), *schemas)
         usd.place(np.add(position, (0.0, 0.0, 10.0)), quaternion)
-        usd.settings(BODY_SETTINGS | {"physics:mass": link.mass, "physxContactReport:threshold": 0.0})
+        usd.settings({**BODY_SETTINGS, "physics:mass": link.mass, "physxContactReport:threshold": 0.0})
         usd.set(
             physics__centerOfMass=f"point3f|{_tuple(link.center)}", physics__diagonalInertia="float3|(0.1, 0.1, 0.1)"
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import warnings
 from collections.abc import Mapping
 from functools import cache
@@ -12,6 +13,7 @@ from typing import Any
 import numpy as np
 import ovphysx
 import ovstage
+from numpy.typing import NDArray
 from ovphysx.samples.python_samples.schema_support import physx_schema_paths
 from ovphysx.types import TensorType
 
@@ -48,6 +50,8 @@ _TENSORS = {
 def _prepare() -> None:
     """Set up the process: one thread, no GPU, PhysX's schemas."""
     warnings.filterwarnings("ignore", category=DeprecationWarning, module="ovphysx")
+    # a world says nothing in Newton's schema, which ovphysx would like to see
+    logging.getLogger("ovphysx").addFilter(lambda record: "newton-usd-schemas" not in record.getMessage())
     ovphysx.set_global_config(ovphysx.GlobalConfigKey.NUM_THREADS, 0)
     ovphysx.PhysX.set_cpu_mode(True)
     ovstage.population.register_usd_schemas([str(path) for path in physx_schema_paths()])
@@ -258,7 +262,7 @@ class PhysxWorld(World):
         self._physx.destroy()
 
 
-def _entries(count: Array, start: Array) -> list[tuple[int, int, int]]:
+def _entries(count: NDArray[np.int32], start: NDArray[np.int32]) -> list[tuple[int, int, int]]:
     """Return sensor, filter and slot of each entry of a flat buffer."""
     pairs = zip(*np.nonzero(count), strict=True)
     return [(int(s), int(f), int(start[s, f]) + i) for s, f in pairs for i in range(count[s, f])]

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from gaitgauge.backends.base import CAPABILITY_NAMES, Support
 from gaitgauge.backends.drake.limits import LIMITS as DRAKE
+from gaitgauge.backends.physx.limits import LIMITS as PHYSX
 from gaitgauge.backends.registry import find_backend
 from gaitgauge.backends.sequential.limits import declare
 
@@ -16,7 +17,7 @@ DOCUMENT = Path(__file__).parents[2] / "docs" / "reference" / "backends.md"
 
 BEGIN, END = "<!-- capabilities: begin -->", "<!-- capabilities: end -->"
 """The table's place in the document."""
-EXTRAS = {"drake": DRAKE}
+EXTRAS = {"drake": DRAKE, "physx": PHYSX}
 """Limits of engines that extras install, which need not be there."""
 ENGINES = ("mujoco", "mujoco-warp", "newton", "newton:steel", *EXTRAS)
 """Columns: every engine of the project, with each solver."""

@@ -13,7 +13,7 @@ def test_every_engine_and_capability_is_there():
     assert [c.strip().strip("`") for c in lines[0].split("|")[2:-1]] == list(ENGINES)
     rows = [line.split("|")[1].strip().strip("`") for line in lines[2:] if line.startswith("|")]
     assert rows == list(CAPABILITY_NAMES)
-    own = {n for n in backend_names() if n in ("mujoco", "mujoco-warp", "newton", "drake")}
+    own = {n for n in backend_names() if n in ("mujoco", "mujoco-warp", "newton", "drake", "physx")}
     assert own <= set(ENGINES)
     assert {f"newton:{s}" for s in SOLVERS if s != "mujoco"} <= set(ENGINES)
 
@@ -23,7 +23,7 @@ def test_cells_say_what_is_declared():
         line.split("|")[1].strip(): line.split("|")[2:-1] for line in capability_table().splitlines() if "|" in line
     }
     gpu = [c.split()[0] for c in rows["`gpu`"]]
-    assert gpu == ["no", "yes", "yes", "yes", "no"]
+    assert gpu == ["no", "yes", "yes", "yes", "no", "no"]
     assert rows["`foot_condim_6`"][ENGINES.index("newton:steel")].split()[0] == "no"
     assert rows["`latency`"][0].strip() == "yes"
 
