@@ -17,6 +17,7 @@ class DrakeBackend(SequentialBackend):
     """Drake's multibody plant, one context a world."""
 
     name: ClassVar[str] = "drake"
+    family: ClassVar[str] = "Drake"
     own_dry_friction: ClassVar[bool] = False
     limits: ClassVar[Mapping[str, Capability]] = LIMITS
 

@@ -18,6 +18,7 @@ class PhysxBackend(SequentialBackend):
     """PhysX by ovphysx, one instance a world."""
 
     name: ClassVar[str] = "physx"
+    family: ClassVar[str] = "PhysX"
     own_dry_friction: ClassVar[bool] = True
     precision: ClassVar[torch.dtype] = torch.float32
     limits: ClassVar[Mapping[str, Capability]] = LIMITS
