@@ -55,7 +55,9 @@ def imported() -> dict[str, str]:
 def test_what_is_imported_is_asked_for_and_nothing_else():
     listed, extras = project()["project"]["dependencies"], project()["project"]["optional-dependencies"]
     asked = {distribution(text) for text in listed}
-    optional = {distribution(text) for name in ("gamepad", "cluster", "drake", "physx", "mcap") for text in extras[name]}
+    optional = {
+        distribution(text) for name in ("gamepad", "cluster", "drake", "physx", "mcap") for text in extras[name]
+    }
     found = imported()
     assert {name: file for name, file in found.items() if name not in asked | optional} == {}
     assert asked - found.keys() == set()
