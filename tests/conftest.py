@@ -1,7 +1,10 @@
 """What all tests share."""
 
 import gc
+import json
 import os
+import pickle
+import random
 import signal
 import sys
 from collections.abc import Iterator
@@ -9,11 +12,13 @@ from copy import copy
 from functools import cache
 from importlib.metadata import entry_points
 from pathlib import Path
+from typing import Any
 
 # Two workers with two threads each wait for each other on two cores; to be said before anything imports torch.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import pytest
+import torch
 import typer
 
 # Programs that tests start find the scripted engine as pytest does: a folder on the import path is an installation to Python.
@@ -25,6 +30,7 @@ def pytest_collection_finish() -> None:
     """Leave what the packages made when they were imported out of every later search for garbage."""
     gc.collect()
     gc.freeze()
+    gc.set_threshold(50_000, 20, 20)  # tests leave little behind, and the searches took a fiftieth of the time
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -63,6 +69,70 @@ def robots_that_ship_are_read_once() -> Iterator[None]:
         patch.setattr(registry, "_named", lambda text: known(text) if text in own else named(text))
         patch.setattr(loading, "model_files", model_files)
         patch.setattr(mujoco.MjModel, "from_xml_path", staticmethod(from_xml_path))
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def noise_of_a_seed_is_drawn_once() -> Iterator[None]:
+    """Python draws the reference's noise number by number, which took a third of the time of the gauge's tests."""
+    from gaitgauge.gauge.play.noise import ReferenceStream
+
+    plain, drawn = ReferenceStream._tables, {}
+
+    def tables(self: ReferenceStream, generators: list[random.Random], count: int) -> tuple[torch.Tensor, torch.Tensor]:
+        if len(generators) != 1:
+            return plain(self, generators, count)
+        place = (generators[0].getstate(), count, self._noise.latency, tuple(self._half))
+        if place not in drawn:
+            drawn[place] = plain(self, generators, count), generators[0].getstate()
+        made, after = drawn[place]
+        generators[0].setstate(after)
+        return tuple(table.to(self._device) for table in made)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ReferenceStream, "_tables", tables)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def networks_are_recorded_once() -> Iterator[None]:
+    """Most tests play one of a few networks, and recording it takes longer than what is played."""
+    from gaitgauge.policy import native
+
+    plain, recorded = native.frozen, {}
+
+    def frozen(network: torch.nn.Module, num_episodes: int) -> object:
+        try:
+            place = num_episodes, pickle.dumps(network.eval())
+        except (pickle.PicklingError, AttributeError, TypeError):  # made inside of a test
+            return plain(network, num_episodes)
+        if place not in recorded:
+            made = plain(network, num_episodes)
+            recorded[place] = None if made is network else made
+        return network if recorded[place] is None else recorded[place]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(native, "frozen", frozen)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def figures_of_results_are_checked_once() -> Iterator[None]:
+    """Cards that ship and copies of one run are read again and again; whoever changes a figure has another text."""
+    from gaitgauge.gauge.report import page
+    from gaitgauge.studies.compare import comparison
+
+    plain, sound = comparison.check_figures, set()
+
+    def check_figures(result: Any, source: str, error: type[Exception], *, intervals: bool = True) -> None:
+        place = intervals, json.dumps(result.to_data())
+        if place not in sound:
+            plain(result, source, error, intervals=intervals)
+            sound.add(place)
+
+    with pytest.MonkeyPatch.context() as patch:
+        for module in (comparison, page):
+            patch.setattr(module, "check_figures", check_figures)
         yield
 
 

@@ -379,7 +379,14 @@ def assert_equal(records, others):
             assert getattr(one, field).tobytes() == getattr(other, field).tobytes()
 
 
-@pytest.fixture(scope="module", params=[(name, events) for name in (REFERENCE, OWN) for events in EVENTS])
+CASES = [
+    pytest.param((name, events), marks=() if any(events) else pytest.mark.slow)
+    for name in (REFERENCE, OWN)
+    for events in EVENTS
+]
+
+
+@pytest.fixture(scope="module", params=CASES)
 def alone(request):
     """Suite, events, and the records of one world after the other."""
     name, events = request.param
@@ -394,7 +401,7 @@ def test_worlds_and_neighbours_change_no_bit_of_a_record(alone, worlds):
     assert_equal(records, stage(name, worlds, *events, count=2))
 
 
-@pytest.mark.parametrize("poll_interval", [2, 10])
+@pytest.mark.parametrize("poll_interval", [pytest.param(2, marks=pytest.mark.slow), 10])
 def test_the_poll_interval_changes_no_bit_of_a_record(alone, poll_interval):
     """On a GPU reading a value would wait for the device: everything is worked out for every world, and those that end wait."""
     name, events, records = alone

@@ -11,7 +11,7 @@ from gaitgauge.training.sweep.jobs import Jobs
 from gaitgauge.training.sweep.runs import SweepRun
 
 ROOT = Path(__file__).parents[2]
-CARD = ROOT / "docs" / "data" / "scorecards" / "pretrained-gaitgauge-1.json"
+CARD = ROOT / "docs" / "data" / "scorecards" / "standing-gaitgauge-1.json"
 ENTRY = SweepEntry(name="one", task="go2-cts")
 SWEEP = Sweep(name="toy", title="A toy", entry=(ENTRY,), backend="fake", training_suite="none")
 
@@ -52,6 +52,7 @@ if {self.entry.name!r} == "damaged": (run / "run.json").write_text("{{")
 
     def gauging_command(self, sweep, *, where):
         card = json.loads(CARD.read_text())
+        card["suite"]["digest"] = load_suite(sweep.suite).digest
         card["policy"]["file_sha256"] = file_digest(str(self.policy(sweep)))
         (self.folder / "card.json").write_text(json.dumps(card))
         program = f"""

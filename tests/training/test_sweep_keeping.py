@@ -21,7 +21,7 @@ from gaitgauge.training.sweep.runs import plan_runs
 from torch.utils.tensorboard import SummaryWriter
 
 ROOT = Path(__file__).parents[2]
-CARD = ROOT / "docs" / "data" / "scorecards" / "pretrained-robogauge-1.1.json"
+CARD = ROOT / "docs" / "data" / "scorecards" / "standing-robogauge-1.1.json"
 SWEEP = Sweep(
     name="toy",
     title="A toy",
