@@ -172,6 +172,11 @@ def total_mass(robot: Robot) -> float:
     return float(robot_model(robot).body_mass.sum())
 
 
+def base_mass(robot: Robot) -> float:
+    """Return the mass of the robot's base body [kg]."""
+    return float(robot_model(robot).body(robot.base_body).mass[0])
+
+
 def robot_model(robot: Robot) -> mujoco.MjModel:
     """Compile the robot's model."""
     import mujoco

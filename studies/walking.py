@@ -6,6 +6,7 @@ are those of the gauge's rollout; goals, settling and samples are the caller's a
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
 
 import torch
@@ -31,6 +32,7 @@ class Walk:
         *,
         steps: int = 0,
         session: PolicySession | None = None,
+        latency: Sequence[int | None] = (),
     ) -> None:
         """Prepare the robots; ``reset`` puts them to their start.
 
@@ -40,6 +42,7 @@ class Walk:
             episodes: with noise, one for each robot, whose stream of random numbers it has.
             steps: with noise, control steps that are not exceeded.
             session: the policy at work, where it is not to be an ordinary one.
+            latency: physics steps by which each robot's actions take effect late; None, or none at all, for the noise's own.
 
         Raises:
             ContractError: the policy is not for this robot.
@@ -56,6 +59,14 @@ class Walk:
             self._noise = NoiseReader(make_stream(noise, robot.num_joints, count, device), count, device)
             self._noise.begin(range(count), episodes, [0] * count, steps)
         self._action = torch.zeros(count, robot.num_joints, device=device)
+        self._latency: torch.Tensor | None = None
+        if any(late is not None for late in latency):
+            self._latency = torch.tensor([-1 if late is None else late for late in latency], device=device)
+            self._targets: deque[torch.Tensor] = deque(maxlen=1 + int(self._latency.max()) // self._substeps)
+
+    @property
+    def _substeps(self) -> int:
+        return self.backend.scene.physics.substeps
 
     @property
     def state(self) -> PhysicsState:
@@ -73,6 +84,8 @@ class Walk:
         self._builder.reset()
         self._session.reset()
         self._action.zero_()
+        if self._latency is not None:
+            self._targets.extend([pose] * (self._targets.maxlen or 0))
 
     def step(self, command: torch.Tensor, worlds: torch.Tensor | None = None) -> None:
         """Advance one control period.
@@ -96,4 +109,17 @@ class Walk:
                 "finite numbers"
             )
         self._action = action
-        self.backend.step(self._builder.targets(action), delay=delay, worlds=worlds)
+        targets = self._builder.targets(action)
+        if self._latency is not None:
+            targets, delay = self._late(targets, delay)
+        self.backend.step(targets, delay=delay, worlds=worlds)
+
+    def _late(self, targets: torch.Tensor, delay: torch.Tensor | None) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return the targets of whole control periods ago, and the physics steps by which these are late besides."""
+        assert self._latency is not None
+        self._targets.append(targets)
+        late = self._latency.clamp(min=0)
+        ago = len(self._targets) - 1 - late // self._substeps
+        chosen = torch.stack(tuple(self._targets))[ago, torch.arange(len(late), device=late.device)]
+        own = torch.zeros_like(late) if delay is None else delay
+        return chosen, torch.where(self._latency < 0, own, late % self._substeps)

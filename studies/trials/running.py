@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from ...backends.base import PhysicsBackend, PhysicsState, Randomization, Scene
 from ...backends.registry import make_backend
@@ -24,9 +25,10 @@ from ...gauge.motors import joint_parameters
 from ...gauge.suite import load_suite
 from ...policy.base import Policy
 from ...robots import Robot
+from ...robots.body_plan import base_mass
 from ...robots.rotation import from_heading, from_yaw, rotate_inverse, tilt
 from ..walking import Walk
-from .scenario import Force, Scenario
+from .scenario import Force, Ground, Scenario, ScenarioError
 from .timeline import Timeline
 
 SMOOTHING = 0.1
@@ -37,6 +39,8 @@ _TOUCH = 1.0
 """Force of the ground on the trunk that counts as lying on it [N]."""
 _DIRECTIONS = {"left": (0.0, 1.0), "right": (0.0, -1.0), "forward": (1.0, 0.0), "backward": (-1.0, 0.0)}
 
+Make = Callable[[Scene], PhysicsBackend]
+"""Builds the worlds of a scene."""
 Watch = Callable[[PhysicsState, torch.Tensor], None]
 """Called after every control step with the state and with whether each robot was told to move in it, (N,) bool."""
 
@@ -130,70 +134,112 @@ def run_scenario(
         RobotError: the robot lacks the joint parameters of the scenario's suite.
         SuiteError: the policy's control period is not that of the scenario's suite, or too long.
     """
-    scene = make_scene(scenario, robot, policy, len(seeds))
+    each = [(scenario, seed) for seed in seeds]
+    return run_each(policy, robot, each, backend=backend, device=device, threads=threads, watch=watch)
+
+
+def run_each(
+    policy: Policy,
+    robot: Robot,
+    trials: Sequence[tuple[Scenario, int]],
+    *,
+    backend: str | Make = "mujoco",
+    device: str = "cpu",
+    threads: int = 1,
+    watch: Watch | None = None,
+) -> list[Trial]:
+    """Send robots through scenarios of their own, side by side. Each has the outcome that ``run_scenario`` gives it.
+
+    Args:
+        trials: scenario and seed of each robot; suite, limits of torque and tilt of a fall are the same in all.
+        backend: engine, or a function that builds the worlds of a scene.
+
+    Raises:
+        ScenarioError: scenarios that cannot be played together; else as ``run_scenario``.
+    """
+    scene = make_scene([scenario for scenario, _ in trials], robot, policy)
     if torch.device(device).type == "cpu":
         torch.set_num_threads(1)  # several would change the last bits of the policy's output
-    with closing(make_backend(backend, scene, device=device, threads=threads)) as physics, torch.inference_mode():
-        return _Run(policy, scenario, seeds, physics).play(watch)
+    worlds = (
+        make_backend(backend, scene, device=device, threads=threads) if isinstance(backend, str) else backend(scene)
+    )
+    with closing(worlds) as physics, torch.inference_mode():
+        return _Run(policy, trials, physics).play(watch)
 
 
-def make_scene(scenario: Scenario, robot: Robot, policy: Policy, count: int) -> Scene:
-    """The worlds of ``count`` trials. Raises as ``run_scenario``."""
-    suite = load_suite(scenario.suite)
+def make_scene(scenarios: Sequence[Scenario], robot: Robot, policy: Policy) -> Scene:
+    """Return the worlds of some scenarios, one for each. Raises as ``run_each``."""
+    first = scenarios[0]
+    for other in scenarios:
+        for rule in ("suite", "torque_speed_limit", "failure"):
+            if getattr(other, rule) != getattr(first, rule):
+                raise ScenarioError(
+                    f"scenarios '{first.name}' and '{other.name}' differ in {rule} and cannot be played side by side; play one "
+                    "after the other"
+                )
+    suite = load_suite(first.suite)
     check_fit(suite, robot, policy.contract, longest=min(SMOOTHING, PATH_INTERVAL))
+    grounds: dict[Ground, Scenario] = {}
+    for scenario in scenarios:
+        grounds.setdefault(scenario.ground, scenario)
+    palette = list(grounds)
     return Scene(
         robot=robot,
         parameters=joint_parameters(suite, robot, policy.contract),
-        terrains=(scenario.terrain(),),
-        terrain_index=(0,) * count,
+        terrains=tuple(scenario.terrain() for scenario in grounds.values()),
+        terrain_index=tuple(palette.index(scenario.ground) for scenario in scenarios),
         physics=replace(
             suite.physics,
-            torque_limits=suite.physics.torque_limits or scenario.torque_speed_limit,
-            torque_speed_limit=scenario.torque_speed_limit,
-            watch_tilt=scenario.failure.tilt,
+            torque_limits=suite.physics.torque_limits or first.torque_speed_limit,
+            torque_speed_limit=first.torque_speed_limit,
+            watch_tilt=first.failure.tilt,
             watch_penetration=None,
         ),
     )
 
 
 class _Run:
-    """The trials of one scenario at work."""
+    """Trials at work, one for each world."""
 
-    def __init__(self, policy: Policy, scenario: Scenario, seeds: Sequence[int], physics: PhysicsBackend) -> None:
-        self._scenario, self._seeds, self._physics = scenario, seeds, physics
-        self._period = physics.scene.physics.control_period
-        self._steps = math.ceil(scenario.seconds / self._period) + len(scenario.commands)
+    def __init__(self, policy: Policy, trials: Sequence[tuple[Scenario, int]], physics: PhysicsBackend) -> None:
+        self._scenarios, self._seeds = [scenario for scenario, _ in trials], [seed for _, seed in trials]
+        self._physics, self._failure = physics, self._scenarios[0].failure
+        self._period, self._timestep = physics.scene.physics.control_period, physics.scene.physics.timestep
+        self._steps = max(math.ceil(s.seconds / self._period) + len(s.commands) for s in self._scenarios)
         episodes = [
             Episode(
                 terrain=scenario.name,
                 level=0,
                 friction=scenario.friction,
-                payload=0.0,
+                payload=0.0 if scenario.payload is None else scenario.payload.kilograms,
                 seed=seed,
                 stage="trial",
                 goals=(),
             )
-            for seed in seeds
+            for scenario, seed in trials
         ]
-        self._walk = Walk(policy, physics, load_suite(scenario.suite).noise, episodes, steps=self._steps)
-        drawn = [draws(scenario, seed) for seed in seeds]
+        noise = load_suite(self._scenarios[0].suite).noise
+        late = [None if s.latency is None else round(s.latency / self._timestep) for s in self._scenarios]
+        self._walk = Walk(policy, physics, noise, episodes, steps=self._steps, latency=late)
+        drawn = [draws(scenario, seed) for scenario, seed in trials]
         self._offsets = np.array([offset for offset, _ in drawn])
         self._pulls = [pulls for _, pulls in drawn]
         tensor = self._walk.tensor
         most = max(map(len, self._pulls), default=0)
         padded = [[*pulls, *[_NO_PULL] * (most - len(pulls))] for pulls in self._pulls]
-        shape = (len(seeds), most)
+        shape = (len(trials), most)
         self._begin = tensor([[p.begin for p in row] for row in padded]).view(shape)
         self._end = self._begin + tensor([[p.seconds for p in row] for row in padded]).view(shape)
         self._pull = tensor([[[p.newtons * d for d in p.direction] for p in row] for row in padded]).view(*shape, 2)
 
     def play(self, watch: Watch | None) -> list[Trial]:
         """Until every trial is over."""
-        scenario, physics, walk = self._scenario, self._physics, self._walk
+        physics, walk, failure = self._physics, self._walk, self._failure
         count = len(self._seeds)
-        physics.randomize(Randomization(friction=walk.tensor([scenario.friction] * count)))
+        frictions = self._frictions()
+        physics.randomize(replace(self._payloads(), friction=walk.tensor(frictions[0])))
         self._to_start()
-        timeline = Timeline(scenario, self._period, self._line, physics.state.base_position_w)
+        timeline = Timeline(self._scenarios, self._period, physics.state.base_position_w)
         active = torch.ones(count, dtype=torch.bool, device=physics.device)
         lying = walk.tensor([0.0] * count)
         rows: list[tuple[torch.Tensor, ...]] = []
@@ -203,15 +249,18 @@ class _Run:
             active = active & ~timeline.over
             if not bool(active.any()):
                 break
-            if scenario.forces:
+            if step and (frictions[step] != frictions[step - 1]).any():
+                changed = torch.from_numpy(frictions[step] != frictions[step - 1]).to(physics.device)
+                physics.randomize(Randomization(friction=walk.tensor(frictions[step])[changed]), changed)
+            if self._begin.shape[1]:
                 physics.apply_force(self._force(step * self._period, state))
             walk.step(command, active)
             state = physics.state
             touches = state.trunk_contact_force_w.norm(dim=1) > _TOUCH
             lying = torch.where(touches, lying + self._period, 0.0)
             fell = (state.tilt_substep > 0) | state.diverged
-            if scenario.failure.lying is not False:
-                fell |= lying >= scenario.failure.lying - 1e-9
+            if failure.lying is not False:
+                fell |= lying >= failure.lying - 1e-9
             moving = active & command.any(dim=1)
             if watch is not None:
                 watch(state, moving)
@@ -223,14 +272,34 @@ class _Run:
         columns = [np.stack(c) for c in zip(*(tuple(x.cpu().numpy() for x in row) for row in rows), strict=True)]
         return [self._trial(i, diverged[i], *(c[:, i] for c in columns)) for i in range(count)]
 
+    def _frictions(self) -> NDArray[np.float64]:
+        """Return the friction of each world in every control step, (T, N)."""
+        table = np.tile([scenario.friction for scenario in self._scenarios], (self._steps, 1))
+        for world, scenario in enumerate(self._scenarios):
+            for patch in scenario.patches:
+                begin, end = (round(t / self._period) for t in (patch.begin, patch.begin + patch.seconds))
+                table[begin:end, world] = patch.friction
+        return table
+
+    def _payloads(self) -> Randomization:
+        """Return what the payloads change; nothing where no scenario has one."""
+        loads = [scenario.payload for scenario in self._scenarios]
+        if not any(loads):
+            return Randomization()
+        own, tensor = base_mass(self._physics.scene.robot), self._walk.tensor
+        masses = [0.0 if load is None else load.kilograms for load in loads]
+        places = [(0.0, 0.0, 0.0) if load is None else load.place for load in loads]
+        shifts = [[m / (m + own) * along for along in place] for m, place in zip(masses, places, strict=True)]
+        return Randomization(base_mass_offset=tensor(masses), base_com_offset=tensor(shifts))
+
     def _to_start(self) -> None:
         """Put the robots on the ground."""
-        start, scene = self._scenario.start, self._physics.scene
-        x, y = start.x + self._offsets[:, 0], start.y + self._offsets[:, 1]
-        z = scene.terrains[0].height(x, y) + scene.robot.stand_height
-        yaw = self._walk.tensor(start.yaw + self._offsets[:, 2])
-        self._line = (start.x, start.y, start.yaw)
-        self._walk.reset(self._walk.tensor(np.stack((x, y, z), axis=1)), from_yaw(yaw))
+        scene = self._physics.scene
+        starts = np.array([(s.start.x, s.start.y, s.start.yaw) for s in self._scenarios]) + self._offsets
+        x, y, yaw = starts.T
+        ground = [float(scene.terrains[t].height(x[i], y[i])) for i, t in enumerate(scene.terrain_index)]
+        z = np.array(ground) + scene.robot.stand_height
+        self._walk.reset(self._walk.tensor(np.stack((x, y, z), axis=1)), from_yaw(self._walk.tensor(yaw)))
 
     def _force(self, time: float, state: PhysicsState) -> torch.Tensor:
         """External force on every base at a time [s] after the start, world frame [N], (N, 3)."""
@@ -241,7 +310,7 @@ class _Run:
     def _trial(self, i: int, diverged: bool, *columns: Any) -> Trial:
         """What came of a robot, from what was noted of it step by step."""
         active, moving, fell, forward, told, tilts, position = columns
-        scenario, period = self._scenario, self._period
+        scenario, period = self._scenarios[i], self._period
         last = max(int(active.sum()) - diverged, 1)  # from its first step on; what diverged is no place any more
         moving, forward, told, position = moving[:last], forward[:last], told[:last], position[:last]
         began = int(moving.argmax()) if moving.any() else 0

@@ -28,6 +28,7 @@ _Moment = Annotated[float, Field(ge=0.0, le=600.0)]
 _Newtons = Annotated[float, Field(ge=0.0, le=10_000.0)]
 _Angle = Annotated[float, Field(ge=-math.pi, le=math.pi)]
 _Spread = Annotated[float, Field(ge=0.0, le=10.0)]
+_Offset = Annotated[float, Field(ge=-2.0, le=2.0)]
 _Number = Annotated[int, Field(ge=0, le=1_000_000)]
 
 
@@ -35,6 +36,8 @@ LONGEST = 3600.0
 """Of all commands together [s]."""
 MOST_PULLS = 1000
 """Of one force."""
+_LATER = ("patches", "payload", "latency")
+"""Fields that came later: where they say nothing, digests are as they were."""
 ON_ITS_BACK = 3.0
 """Tilt that a robot on its back comes to [rad]: π on level ground, less the room that legs and trunk may leave."""
 
@@ -115,6 +118,27 @@ class Force:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Patch:
+    """Another friction of the ground for a time, as on a patch that is wider than the robot."""
+
+    begin: _Moment
+    """[s] after the start."""
+    seconds: _Seconds
+    friction: Friction
+    """Sliding friction coefficient meanwhile; of two patches at a time the later one in the file counts."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Payload:
+    """A point mass that is fixed to the base; the base's own inertia stays."""
+
+    kilograms: Annotated[float, Field(ge=0.0, le=1000.0)]
+    """[kg]."""
+    place: tuple[_Offset, _Offset, _Offset] = (0.0, 0.0, 0.0)
+    """From the base's own centre of mass, forward, left and up [m]."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Success:
     """What must hold by the time the commands are over. A robot that fell has failed, whatever else it did."""
 
@@ -168,6 +192,10 @@ class Scenario:
     commands: Annotated[tuple[Leg, ...], Field(min_length=1, max_length=1000)]
     """One after another, from the start on."""
     forces: Annotated[tuple[Force, ...], Field(max_length=100)] = ()
+    patches: Annotated[tuple[Patch, ...], Field(max_length=100)] = ()
+    payload: Payload | None = None
+    latency: Annotated[float, Field(ge=0.0, le=0.2)] | None = None
+    """Time by which every action takes effect late [s], a whole number of physics steps; None: random, as in the suite."""
     success: Success = field(default_factory=Success)
     failure: Failure = field(default_factory=Failure)
     reported: Annotated[tuple[Reported, ...], Field(max_length=100)] = ()
@@ -181,7 +209,8 @@ class Scenario:
     def digest(self) -> str:
         """SHA-256 over all that decides about outcomes, hexadecimal."""
         words = ("title", "about", "repeats", "reported")
-        rules = {k: v for k, v in asdict(self).items() if k not in words} | {"suite": load_suite(self.suite).digest}
+        rules = {k: v for k, v in asdict(self).items() if k not in words and (k not in _LATER or v not in ((), None))}
+        rules |= {"suite": load_suite(self.suite).digest}
         return hashlib.sha256(json.dumps(rules, sort_keys=True).encode()).hexdigest()
 
     def terrain(self) -> Terrain:
@@ -271,6 +300,12 @@ def _problems(scenario: Scenario) -> Iterator[str]:
         if force.every is not None and seconds / force.every > MOST_PULLS:
             yield (
                 f"forces[{number}] pulls every {force.every:g} s of {seconds:g} s; at most {MOST_PULLS:,} pulls are possible"
+            )
+    for number, patch in enumerate(scenario.patches):
+        if patch.begin >= seconds:
+            yield (
+                f"patches[{number}] begins after {patch.begin:g} s, when the commands, of {seconds:g} s, are over; let it begin "
+                "sooner"
             )
     for number, found in enumerate(scenario.reported):
         successes, trials = found.successes, found.trials

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+
 import torch
 
 from ...backends.base import PhysicsState
 from ...robots.rotation import yaw_of
-from .scenario import Scenario
+from .scenario import Leg, Scenario
 
 _AHEAD = 1.5
 """How far ahead on the line the operator looks [m]."""
@@ -17,41 +19,43 @@ _FASTEST_TURN = 1.0
 
 
 class Timeline:
-    """Each robot's place in the scenario's commands."""
+    """Each robot's place in its scenario's commands."""
 
-    def __init__(
-        self, scenario: Scenario, period: float, line: tuple[float, float, float], position: torch.Tensor
-    ) -> None:
+    def __init__(self, scenarios: Sequence[Scenario], period: float, position: torch.Tensor) -> None:
         """Begin with the first phase.
 
         Args:
+            scenarios: one for each robot.
             period: control period [s].
-            line: x, y [m] and heading [rad] of the line that steering keeps to.
-            position: of the robots (N, 3), for their number and what they are kept in.
+            position: of the robots (N, 3), for what numbers are kept in.
         """
-        phases, device = scenario.commands, position.device
-        limits = [float("inf") if phase.until_x is None else phase.until_x for phase in phases]
-        columns = (
-            [*(phase.steps(period) for phase in phases), 2**62],
-            [*limits, float("inf")],
-            [*(phase.steer for phase in phases), False],
-        )
-        self._tables = [torch.tensor(column, device=device) for column in columns]  # the last row: all is over
-        velocities = [*(phase.velocity for phase in phases), (0.0, 0.0, 0.0)]
-        self._commands = torch.tensor(velocities, device=device, dtype=position.dtype)
-        self._line, self._last = line, len(phases)
-        self._phase = torch.zeros(len(position), dtype=torch.int64, device=device)
-        self._done = torch.zeros_like(self._phase)
+        longest = 1 + max(len(scenario.commands) for scenario in scenarios)
+
+        def table(values: Callable[[Leg], object], last: object, like: torch.Tensor | None = None) -> torch.Tensor:
+            rows = [[values(phase) for phase in scenario.commands] for scenario in scenarios]
+            filled = [
+                row + [last] * (longest - len(row)) for row in rows
+            ]  # from the first of these rows on all is over
+            return torch.tensor(filled, device=position.device, dtype=None if like is None else like.dtype)
+
+        self._lengths = table(lambda phase: phase.steps(period), 2**62)
+        self._limits = table(lambda p: float("inf") if p.until_x is None else p.until_x, float("inf"), position)
+        self._steer = table(lambda phase: phase.steer, False)
+        self._commands = table(lambda phase: phase.velocity, (0.0, 0.0, 0.0), position)
+        lines = [(s.start.x, s.start.y, s.start.yaw) for s in scenarios]
+        self._line = torch.tensor(lines, device=position.device, dtype=position.dtype)
+        self._last = torch.tensor([len(scenario.commands) for scenario in scenarios], device=position.device)
+        self._robots = torch.arange(len(scenarios), device=position.device)
+        self._phase, self._done = torch.zeros_like(self._last), torch.zeros_like(self._last)
 
     def next(self, state: PhysicsState) -> torch.Tensor:
         """Commands of the coming control step: forward, lateral [m/s] and yaw [rad/s], (N, 3); zero where they are over."""
-        position = state.base_position_w
-        lengths, limits, steer = self._tables
-        ends = (self._done >= lengths[self._phase]) | (position[:, 0] >= limits[self._phase])
+        at = (self._robots, self._phase)
+        ends = (self._done >= self._lengths[at]) | (state.base_position_w[:, 0] >= self._limits[at])
         self._phase += ends
         self._done = torch.where(ends, 0, self._done) + 1
-        command = self._commands[self._phase]
-        steered = steer[self._phase]
+        at = (self._robots, self._phase)
+        command, steered = self._commands[at], self._steer[at]
         if bool(steered.any()):
             command = torch.where(steered[:, None], torch.cat((command[:, :2], self._turn(state)), dim=1), command)
         return command
@@ -63,10 +67,9 @@ class Timeline:
 
     def _turn(self, state: PhysicsState) -> torch.Tensor:
         """Yaw speed with which an operator brings the robot back to its line, (N, 1) [rad/s]."""
-        x, y, yaw = self._line
-        offset = state.base_position_w - torch.tensor([x, y, 0.0], device=state.base_position_w.device)
-        cos, sin = torch.cos(torch.tensor(yaw)), torch.sin(torch.tensor(yaw))
-        aside = cos * offset[:, 1] - sin * offset[:, 0]
+        x, y, yaw = self._line.unbind(1)
+        position = state.base_position_w
+        aside = torch.cos(yaw) * (position[:, 1] - y) - torch.sin(yaw) * (position[:, 0] - x)
         wanted = yaw - torch.atan2(aside, torch.full_like(aside, _AHEAD))
         off = wanted - yaw_of(state.base_quaternion_w)
         off = torch.atan2(torch.sin(off), torch.cos(off))

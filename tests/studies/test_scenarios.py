@@ -59,6 +59,13 @@ def test_a_scenario_differs_in_its_digest_by_what_decides_about_outcomes_alone(t
     assert load(tmp_path, OWN.replace("friction = 0.6", "friction = 0.7")).digest != own.digest
 
 
+def test_fields_that_came_later_leave_digests_as_they_were(tmp_path):
+    """Worked out before there were patches, payloads and latencies."""
+    assert load_scenario("sprint").digest == "d3d2ecf7bcbb565df29ac2afdc3db5b6203e068ab0669d4cf4a5d20302649880"
+    own = load(tmp_path, OWN)
+    assert load(tmp_path, OWN.replace("friction = 0.6", "friction = 0.6\nlatency = 0.0")).digest != own.digest
+
+
 def test_unknown_names_are_refused_with_those_that_are_near():
     with pytest.raises(
         ScenarioError, match=r"did you mean 'lateral-pull' or 'lateral-impulse'[?] choose one of drop-60cm, "
@@ -74,6 +81,11 @@ def test_unknown_names_are_refused_with_those_that_are_near():
     ("old", "new", "sentence"),
     [
         ('name = "own"', 'name = "sprint"', "is called 'sprint' as a scenario that ships"),
+        (
+            "[success]",
+            "[[patches]]\nbegin = 2.0\nseconds = 1.0\nfriction = 0.1\n[success]",
+            r"patches\[0\] begins after 2 s, when the commands, of 2 s, are over",
+        ),
         ("survive = true", "survive = false", "nothing says what success is, so it can never be decided"),
         ("[success]\nsurvive = true", "", "nothing says what success is"),
         ("survive = true", "beyond = 3.0", "commands lead no further than to 2.05 m, so success can never be decided"),

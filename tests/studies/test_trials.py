@@ -11,9 +11,21 @@ import torch
 from gaitgauge.gauge.chance.intervals import wilson_interval
 from gaitgauge.gauge.suite import SuiteError
 from gaitgauge.policy.loading import load_policy
+from gaitgauge.robots.body_plan import base_mass
 from gaitgauge.studies.trials import running
-from gaitgauge.studies.trials.running import Trial, draws, run_scenario
-from gaitgauge.studies.trials.scenario import Failure, Force, Ground, Leg, Scenario, Start, Success
+from gaitgauge.studies.trials.running import Trial, draws, run_each, run_scenario
+from gaitgauge.studies.trials.scenario import (
+    Failure,
+    Force,
+    Ground,
+    Leg,
+    Patch,
+    Payload,
+    Scenario,
+    ScenarioError,
+    Start,
+    Success,
+)
 from gaitgauge.terrains.course import Stretch
 from gaitgauge_fake_engine import FakeBackend, FakeScript
 from scripted_gauge import GO2, ScriptedPolicy
@@ -208,3 +220,69 @@ def test_a_control_period_above_that_of_means_is_refused(tmp_path):
     policy.contract = replace(policy.contract, control_period=0.3)
     with pytest.raises(SuiteError, match=r"control period is 0\.3 s, and what is noted here every 0\.1 s needs one"):
         play(scenario(STAND, suite=str(path)), policy)
+
+
+class Watched(FakeBackend):
+    """Keeps friction and first joint target of all worlds after each step."""
+
+    def __init__(self, scene):
+        super().__init__(scene)
+        self.friction, self.acting, self.delays = [], [], []
+
+    def step(self, *arguments, **options):
+        super().step(*arguments, **options)
+        self.delays.append(options["delay"])
+        self.friction.append(self.randomized.friction.clone())
+        self.acting.append(self.targets[:, 0].clone())
+
+    def play(self, policy, *trials):
+        def make(scene):
+            self.__init__(scene)
+            return self
+
+        return run_each(policy, GO2, [(trial, 0) for trial in trials], backend=make)
+
+
+def test_patches_change_the_friction_for_their_time_and_payloads_shift_the_mass():
+    patch_ = Patch(begin=0.1, seconds=0.06, friction=0.2)
+    load = Payload(kilograms=2.0, place=(0.1, 0.0, -0.05))
+    slipping = scenario(replace(STAND, seconds=0.3), patches=(patch_,))
+    worlds = Watched.__new__(Watched)
+    worlds.play(ScriptedPolicy(), slipping, scenario(replace(STAND, seconds=0.3), payload=load))
+    assert [f[0].item() for f in worlds.friction[:10]] == [0.6] * 5 + [0.2] * 3 + [0.6] * 2
+    assert {f[1].item() for f in worlds.friction} == {0.6}
+    assert worlds.randomized.base_mass_offset.tolist() == [0.0, 2.0]
+    share = 2.0 / (2.0 + base_mass(GO2))
+    assert worlds.randomized.base_com_offset[1].tolist() == pytest.approx([0.1 * share, 0.0, -0.05 * share])
+
+
+def test_a_latency_of_more_than_a_control_period_delays_every_target():
+    """Actions count the steps; with two substeps a period, 50 ms are five substeps: two periods and one substep."""
+    steps = iter(range(1, 100))
+    policy = ScriptedPolicy(lambda observation: torch.full((len(observation), 12), float(next(steps))))
+    still = replace(STAND, seconds=0.2)
+    worlds = Watched.__new__(Watched)
+    worlds.play(policy, scenario(still, latency=0.05), scenario(still, latency=0.0))
+    late, prompt = (torch.stack(worlds.acting)[:, i].numpy() for i in range(2))
+    # the policy is asked for one robot after the other: the second one's actions are one count, 0.25 rad, ahead
+    assert late[2:] + 0.25 == pytest.approx(prompt[:-2]) and np.ptp(late[:2]) == 0.0
+    assert np.diff(prompt) == pytest.approx(0.5)
+    assert all(delay.tolist() == [1, 0] for delay in worlds.delays)
+
+
+def test_scenarios_side_by_side_have_the_outcomes_that_they_have_alone():
+    policy = load_policy("pretrained")
+    common = {"suite": "gaitgauge-1", "start": Start()}
+    slow = scenario(replace(AHEAD, seconds=0.3), payload=Payload(kilograms=3.0), latency=0.03, **common)
+    steps = Ground(begin=0.3, stretches=(Stretch(length=3.0, rise=0.5, steps=5),))
+    fast = scenario(replace(STAND, seconds=0.1), replace(AHEAD, seconds=0.4), ground=steps, **common)
+    pull = Force(direction="side", newtons=(100.0, 150.0), begin=(0.1, 0.2), seconds=(0.2, 0.3))
+    pulled = scenario(replace(AHEAD, seconds=0.4, steer=True), forces=(pull,), **common)
+    each = [(slow, 0), (fast, 3), (pulled, 1)]
+    assert run_each(policy, GO2, each) == [run_scenario(policy, GO2, s, [seed])[0] for s, seed in each]
+
+
+def test_scenarios_of_two_suites_are_not_played_side_by_side():
+    pair = [(scenario(STAND), 0), (scenario(STAND, suite="gaitgauge-1"), 0)]
+    with pytest.raises(ScenarioError, match="'own' and 'own' differ in suite and cannot be played side by side"):
+        run_each(ScriptedPolicy(), GO2, pair)
