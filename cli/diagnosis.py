@@ -39,7 +39,7 @@ def examine_policy(choice: str, request: DoctorRequest) -> bool:
     policy, body = open_policy(choice, request.robot, trust=request.trust, contract_file=contract)
     with ProgressDisplay(Terminal(stderr=True), "playing as described and otherwise") as display:
 
-        def report(mistakes: int, played: int, count: int) -> None:
+        def report(mistakes: int, count: int, played: int) -> None:
             things = "one thing" if mistakes == 1 else f"{mistakes} things"
             display.update(played / count, f"{played} of {count} contracts that differ in {things}")
 

@@ -57,6 +57,11 @@ def _joint_orders(contract: PolicyContract, robot: Robot) -> Iterator[Alternativ
             yield Alternative(kind="joint order", text=f"{text}; values per joint as they stand", contract=stayed)
 
 
+def joint_order_text(robot: Robot, names: tuple[str, ...]) -> str:
+    """Return an order of joints in words, the names themselves where nothing is known that lists joints so."""
+    return next((text for text, order in _orders(robot) if order == names), ", ".join(names))
+
+
 def _orders(robot: Robot) -> Iterator[tuple[str, tuple[str, ...]]]:
     """Orders in which simulators and makers list joints, with words for each."""
     yield f"as robot '{robot.name}' lists them", robot.joint_names

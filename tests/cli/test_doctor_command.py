@@ -16,6 +16,7 @@ from gaitgauge.studies.doctor.alternatives import alternatives
 @pytest.fixture
 def few(monkeypatch):
     """Only the sign of actions is tried."""
+    monkeypatch.setattr(diagnosis, "fitting_presets", lambda robot, width: {})
     monkeypatch.setattr(
         diagnosis, "alternatives", lambda c, robot: [a for a in alternatives(c, robot) if a.kind == "sign of actions"]
     )
@@ -57,14 +58,14 @@ def test_what_is_read_is_not_written_over(refused, backwards, tmp_path, option):
     assert mine.read_text() == "# mine"
 
 
-@pytest.mark.usefixtures("few")
 def test_json_holds_it_all(run):
     result = run("doctor", "pretrained", "--seconds", 1, "--threads", 1, "--json")
     assert result.exit_code == 0, result.output
     data = json.loads(result.stdout)
     assert data["sound"]
     assert data["contract_lines"] == []
-    assert [o["kind"] for o in data["others"]] == ["sign of actions"]
+    assert {o["kind"] for o in data["others"]} == {"preset"}
+    assert "HIMLoco" in [o["text"] for o in data["others"]]
 
 
 def test_a_file_that_is_no_policy_is_refused(refused, tmp_path):

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import time
 import tomllib
 from dataclasses import replace
 
 import pytest
+from doctor_cases import CASES
 from gaitgauge.gauge.suite import load_suite
 from gaitgauge.policy.contract import PolicyContract, standard_contract
 from gaitgauge.policy.export.files import export_onnx
 from gaitgauge.policy.foreign.described import described_contract, toml_lines
 from gaitgauge.policy.loading import load_policy
 from gaitgauge.robots import load_robot
-from gaitgauge.studies.doctor import diagnosis
+from gaitgauge.studies.doctor import bench, diagnosis
 from gaitgauge.studies.doctor.alternatives import Alternative, alternatives
 from gaitgauge.studies.doctor.diagnosis import Diagnosis, Outcome, diagnose
+from gaitgauge.studies.doctor.differences import changed, differences
 
 GO2 = load_robot("go2")
 GOOD = load_policy("pretrained").contract
@@ -103,6 +106,12 @@ def test_lines_to_change_mend_a_contract_file(tmp_path):
     assert described_contract(mended, GO2).hash == wanted.hash
 
 
+@pytest.fixture
+def no_presets(monkeypatch):
+    """Leaves the search to find what a preset would."""
+    monkeypatch.setattr(diagnosis, "fitting_presets", lambda robot, width: {})
+
+
 def few(*kinds: str):
     """The alternatives of some kinds, and one that does not help."""
 
@@ -113,6 +122,7 @@ def few(*kinds: str):
     return chosen
 
 
+@pytest.mark.usefixtures("no_presets")
 def test_the_sign_of_gravity_is_named(monkeypatch):
     monkeypatch.setattr(diagnosis, "alternatives", few("sign of gravity"))
     found = diagnose(described_as(BROKEN["sign of gravity"]), GO2, seconds=1.0)
@@ -136,6 +146,7 @@ def test_what_looks_wrong_is_named_once():
     assert found.verdict().startswith("the action scale looks wrong: with action scale x, then action scale x")
 
 
+@pytest.mark.usefixtures("no_presets")
 def test_gains_that_make_torques_jump_are_named(monkeypatch):
     """The robot stays up with four times its gains, too, and does not ask for rougher targets."""
 
@@ -152,7 +163,7 @@ def test_gains_that_make_torques_jump_are_named(monkeypatch):
 def test_contacts_and_motors_are_the_gauges():
     """On feet that turn freely a robot turns about twice as fast."""
     gauge = load_suite("gaitgauge-1").physics
-    physics = diagnosis._worlds(GO2, GOOD, 1, 1).scene.physics
+    physics = bench._worlds(GO2, GOOD, 1, 1).scene.physics
     assert (physics.timestep, physics.substeps) == (0.005, 4)
     for name in ("cone", "impratio", "foot_condim", "self_collision", "torque_limits", "torque_speed_limit"):
         assert getattr(physics, name) == getattr(gauge, name), name
@@ -160,21 +171,24 @@ def test_contacts_and_motors_are_the_gauges():
 
 def test_worlds_do_not_ask_for_more_memory_than_a_small_machine_has(monkeypatch):
     """Linux starts no further process where one has asked for more than there is, used or not."""
-    make, counts = diagnosis._worlds, []
+    make, counts = bench._worlds, []
 
     def counted(robot, contract, count, threads):
         counts.append(count)
         return make(robot, contract, count, threads)
 
-    monkeypatch.setattr(diagnosis, "_worlds", counted)
+    monkeypatch.setattr(bench, "_worlds", counted)
+    monkeypatch.setattr(diagnosis, "alternatives", few("sign of actions", "gains"))
     told = []
-    found = diagnose(described_as(GOOD), GO2, seconds=0.04, report=lambda *how_far: told.append(how_far))
-    assert sum(counts) == 4 * (1 + len(found.others))
-    played = [sum(counts[:batch]) // 4 for batch in range(len(counts))]
-    assert told == [(1, before, sum(counts) // 4) for before in played]
-    assert max(counts) * 14e6 < 0.5e9  # a world of MuJoCo asks for 14 MB
+    diagnose(described_as(GOOD), GO2, seconds=0.04, report=lambda *how_far: told.append(how_far))
+    (count,) = counts  # once, for all that is played
+    assert count * 14e6 < 0.5e9  # a world of MuJoCo asks for 14 MB
+    assert told[0] == (1, told[0][1], min(count // 4, told[0][1]))
+    for changes in {step for step, _, _ in told}:
+        assert [done for step, _, done in told if step == changes][-1] == max(n for s, n, _ in told if s == changes)
 
 
+@pytest.mark.usefixtures("no_presets")
 def test_a_good_description_is_left_alone(monkeypatch):
     monkeypatch.setattr(diagnosis, "alternatives", few("sign of gravity"))
     found = diagnose(described_as(GOOD), GO2, seconds=1.0)
@@ -183,7 +197,9 @@ def test_a_good_description_is_left_alone(monkeypatch):
     assert found.verdict().startswith("nothing looks wrong")
 
 
+@pytest.mark.usefixtures("no_presets")
 def test_a_policy_that_only_stands_is_not_sound(monkeypatch):
+    """A robot that stands does what it is told while it is told to stand, and stays up."""
     monkeypatch.setattr(diagnosis, "alternatives", lambda contract, robot: [])
     found = diagnose(described_as(replace(GOOD, action_scale=(0.001,) * 12)), GO2, seconds=1.0)
     assert not found.sound
@@ -196,6 +212,31 @@ def test_a_period_that_the_physics_does_not_have_is_refused():
         diagnose(policy, GO2)
 
 
+def test_a_preset_is_found_and_what_it_mends_is_named(monkeypatch):
+    """Three mistakes at once, which are looked for among the presets alone; what makes no difference is not named."""
+    monkeypatch.setattr(diagnosis, "alternatives", lambda contract, robot: [])
+    wrong = replace(
+        BROKEN["observation scale"], joint_names=GO2.sdk_joint_names, action_scale=(0.5,) * 12, action_clip=100.0
+    )
+    found = diagnose(described_as(wrong), GO2, seconds=1.0)
+    assert {m.kind for m in found.mistakes} == {"joint order", "observation scale", "action scale"}
+    assert found.preset == "go2_rl_gym" and found.best.contract.action_clip == 100.0
+    assert "runs its policies this way (preset go2_rl_gym)" in found.verdict()
+    assert found.mistakes[-1].score == max(m.score for m in found.mistakes)
+
+
+def test_differences_turn_one_contract_into_the_other_in_any_order():
+    wrong = replace(BROKEN["order of observations"], stiffness=tuple(float(n) for n in range(12)), action_clip=3.0)
+    given = replace(wrong, joint_names=by_kind(wrong.joint_names), history=replace(wrong.history, length=2))
+    changes = differences(given, GOOD, GO2)
+    assert {c.kind for c in changes} == {
+        *("joint order", "gains", "order of observations", "action clip", "length of history")
+    }
+    for order in (changes, changes[::-1]):
+        assert changed(given, order).hash == GOOD.hash
+    assert differences(GOOD, GOOD, GO2) == []
+
+
 # ---- everything, which takes a while --------------------------------------------------------------------------------
 
 
@@ -206,7 +247,7 @@ def test_every_mistake_is_named(name):
     assert [name.startswith(m.kind) for m in found.mistakes] == [True]
     # with other damping robots walk as well
     assert found.best.contract.hash == GOOD.hash or name == "gains"
-    assert found.best.score > 0.9
+    assert found.best.score > 0.85
 
 
 @pytest.mark.slow
@@ -220,7 +261,7 @@ def test_two_mistakes_at_once_are_named():
     found = diagnose(described_as(both), GO2)
     assert {m.kind for m in found.mistakes} == {"action scale", "observation scale"}
     assert found.best.contract.hash == GOOD.hash
-    assert found.best.score > 0.9
+    assert found.best.score > 0.85
 
 
 @pytest.mark.slow
@@ -233,3 +274,15 @@ def test_the_order_of_a_file_that_takes_a_history_is_named(tmp_path, order):
     found = diagnose(policy, GO2)
     assert found.mistakes[0].kind == "order of history"
     assert found.best.contract.history.order == good.history.order
+
+
+@pytest.mark.slow
+def test_nine_of_ten_wrong_contracts_are_found_within_a_minute_of_processor_time():
+    """Half of the policies are made as no preset says; ``benchmarks/doctor_cases.py`` prints the table."""
+    right = []
+    for case in CASES:
+        begin = time.process_time()
+        found = diagnose(case.policy(), GO2)
+        assert time.process_time() - begin < 60.0, case.name
+        right.append(case.right(found))
+    assert sum(right) >= 9
