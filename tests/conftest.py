@@ -10,7 +10,7 @@ import sys
 from collections.abc import Iterator
 from copy import copy
 from functools import cache
-from importlib.metadata import entry_points
+from importlib.metadata import EntryPoint, distributions
 from pathlib import Path
 from typing import Any
 
@@ -39,10 +39,15 @@ def nothing_is_found_twice() -> Iterator[None]:
 
     Either takes longer than most of what is tested.
     """
-    found = cache(lambda group, path: entry_points(group=group))
+    found = cache(lambda folder: [(each.name, each.entry_points) for each in distributions(path=[folder])])
+
+    def entry_points(group: str) -> list[EntryPoint]:
+        installed = dict(each for folder in reversed(sys.path) for each in reversed(found(folder)))
+        return [entry for entries in reversed(installed.values()) for entry in entries if entry.group == group]
+
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("typer.testing._get_command", cache(typer.main.get_command))
-        patch.setattr("gaitgauge.files.plugins.entry_points", lambda group: found(group, tuple(sys.path)))
+        patch.setattr("gaitgauge.files.plugins.entry_points", entry_points)
         yield
 
 

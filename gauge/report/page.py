@@ -58,6 +58,9 @@ def write_report(folder: Path) -> Path:
     return page_of(file, "report.html", page, command="evaluate")
 
 
+_short_metric = partial(metric_label, short=True)
+
+
 def _clip(folder: Path) -> bytes | None:
     """Return the film that lies in a folder of results, None where there is none that fits into a page."""
     path = folder / CLIP
@@ -72,7 +75,7 @@ def render(result: Result, clip: bytes | None = None) -> str:
         number=number,
         terrain=terrain_label,
         metric=metric_label,
-        short_metric=partial(metric_label, short=True),
+        short_metric=_short_metric,
         grouped=_grouped,
     )
     return template.render(**report_data(result), clip=None if clip is None else base64.b64encode(clip).decode())

@@ -22,13 +22,17 @@ UNITS = {"position": ("mrad", 1e3), "velocity": ("rad/s", 1.0), "torque": ("N·m
 
 def render_page(results: Mapping[str, Any], pictures: Sequence[Any]) -> str:
     """Return the page as HTML text. Whatever names contain is shown as text and never becomes markup."""
-    template = page_template(__file__, "replay.html.j2", unit=lambda q: UNITS[q][0], scaled=_scaled, number=_number)
+    template = page_template(__file__, "replay.html.j2", unit=_unit, scaled=_scaled, number=_number)
     return template.render(results=results, pictures=pictures, bands=BANDS, units=UNITS)
 
 
 def render_identified(results: Mapping[str, Any]) -> str:
     """Return the page of an identification as HTML text."""
     return page_template(__file__, "identify.html.j2", number=_number).render(results=results)
+
+
+def _unit(quantity: str) -> str:
+    return UNITS[quantity][0]
 
 
 def _scaled(value: float, quantity: str) -> str:
