@@ -1,18 +1,33 @@
 """Score cards are replayed: one that holds, one that does not, and what is refused."""
 
 import json
+import shutil
 
 import pytest
+from gaitgauge.cli.main import app
+from gaitgauge.policy.native import save_policy
 from tiny_suite import SUITE
+from typer.testing import CliRunner
+
+
+@pytest.fixture(scope="module")
+def evaluated(tmp_path_factory, contract, stored):
+    """The folder of an evaluation, its suite and its policy."""
+    folder = tmp_path_factory.mktemp("evaluated")
+    (folder / "tiny.toml").write_text(SUITE)
+    save_policy(folder / "standing.gauge.pt", contract, stored)
+    files = [str(folder / name) for name in ("standing.gauge.pt", "tiny.toml", "run")]
+    command = ["evaluate", files[0], "--suite", files[1], "--out", files[2], "--threads", "1", "--no-clip"]
+    done = CliRunner().invoke(app, command)
+    assert done.exit_code == 0, done.output
+    return folder
 
 
 @pytest.fixture
-def card(run, tmp_path, policy):
+def card(evaluated, tmp_path):
     """A card, its content and the options that replay it."""
-    suite = tmp_path / "tiny.toml"
-    suite.write_text(SUITE)
-    done = run("evaluate", policy, "--suite", suite, "--out", tmp_path / "run", "--threads", 1)
-    assert done.exit_code == 0, done.output
+    suite = evaluated / "tiny.toml"
+    shutil.copytree(evaluated / "run", tmp_path / "run")
     path = tmp_path / "card.json"
     path.write_text((tmp_path / "run" / "results.json").read_text())
     return path, json.loads(path.read_text()), ("--suite", suite, "--threads", 1)

@@ -20,7 +20,7 @@ from gaitgauge.policy.native import NativePolicy
 from gaitgauge.robots import load_robot
 from gaitgauge.terrains.registry import make_terrain
 
-STEPS = 200
+STEPS = 80
 RUNTIME = "onnxruntime==1.16.0"
 RUN = """
 import sys, numpy, onnxruntime
@@ -64,13 +64,13 @@ class RecordedSession(PolicySession):
 
 
 def closed_loop(contract):
-    """Observations (200, 225) and actions (200, 12) of the pretrained policy walking over waves in MuJoCo."""
+    """Observations (80, 225) and actions (80, 12) of the pretrained policy walking over waves in MuJoCo."""
     policy = Recorded(contract)
     suite = load_suite("gaitgauge-1")
     settings = {"backend": "mujoco", "device": "cpu", "friction": 0.6, "seed": 0, "suite": suite}
     session = PlaySession(policy, ROBOT, make_terrain("wave", 3), **settings)
     for step in range(STEPS):
-        session.step((0.8, 0.0, 0.5 if step > 100 else 0.0))
+        session.step((0.8, 0.0, 0.5 if step > STEPS // 2 else 0.0))
     session.close()
     assert session.falls == 0
     return np.array(policy.observations), np.array(policy.actions)

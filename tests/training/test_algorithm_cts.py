@@ -323,7 +323,9 @@ def test_augmentation_of_a_symmetric_policy_changes_nothing():
     assert torch.allclose(both, plain, atol=1e-6)
 
 
-@pytest.mark.parametrize("encoder", ["mlp", "moe", "moe_ng"])
+@pytest.mark.parametrize(
+    "encoder", [pytest.param("mlp", marks=pytest.mark.slow), "moe", pytest.param("moe_ng", marks=pytest.mark.slow)]
+)
 def test_learns_the_toy_task(encoder):
     torch.manual_seed(0)
     seen = []

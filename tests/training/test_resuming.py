@@ -1,6 +1,9 @@
 """What a resumed run takes over where it is not quite the run that wrote the checkpoint."""
 
+import shutil
 from dataclasses import replace
+from functools import cache
+from pathlib import Path
 
 import pytest
 import torch
@@ -33,14 +36,24 @@ def build(folder=None, seed=0, message=None, processes=None, **run):
     )
 
 
-def trained(folder, **run):
-    """A run of 6 iterations whose worlds are all on the last level, and its checkpoint."""
-    runner = build(folder, **run)
-    runner.learn(5)
-    runner.env.parts.memory.level.fill_(2)
-    runner.env.parts.memory.moves_level.zero_()
-    runner.learn(1)
-    return runner, folder / "model_6.pt"
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A run of 6 iterations whose worlds are all on the last level, and a copy of its checkpoint."""
+
+    @cache
+    def run(keep_episodes):
+        runner = build(tmp_path_factory.mktemp("run"), keep_episodes=keep_episodes)
+        runner.learn(5)
+        runner.env.parts.memory.level.fill_(2)
+        runner.env.parts.memory.moves_level.zero_()
+        runner.learn(1)
+        return runner
+
+    def copied(folder, keep_episodes=True):
+        runner = run(keep_episodes)
+        return runner, Path(shutil.copy(runner.log_dir / "model_6.pt", folder))
+
+    return copied
 
 
 def edit(path, **training):
@@ -51,7 +64,7 @@ def edit(path, **training):
 
 
 @pytest.mark.parametrize("keep_episodes", [True, False])
-def test_another_number_of_processes_goes_on_with_schedules_and_levels(tmp_path, keep_episodes):
+def test_another_number_of_processes_goes_on_with_schedules_and_levels(trained, tmp_path, keep_episodes):
     reached, path = trained(tmp_path, keep_episodes=keep_episodes)
     levels = reached.env.parts.memory.level
     edit(path, world_size=2)
@@ -69,7 +82,7 @@ def test_another_number_of_processes_goes_on_with_schedules_and_levels(tmp_path,
     assert float(resumed.env.progress) == pytest.approx(42 / 75)
 
 
-def test_a_checkpoint_without_an_environment_goes_on_with_its_schedules(tmp_path):
+def test_a_checkpoint_without_an_environment_goes_on_with_its_schedules(trained, tmp_path):
     _, path = trained(tmp_path)
     entries = torch.load(path, weights_only=True)
     del entries["training"]["environment"], entries["training"]["random"]
@@ -85,7 +98,7 @@ def test_a_checkpoint_without_an_environment_goes_on_with_its_schedules(tmp_path
     assert "what was left of several processes, not 1: episodes start anew, at 48 % of the schedules" in said[0]
 
 
-def test_running_episodes_of_a_whole_checkpoint_keep_their_ages(tmp_path):
+def test_running_episodes_of_a_whole_checkpoint_keep_their_ages(trained, tmp_path):
     """Whatever the setting of the resumed run, which only says what its own checkpoints hold."""
     reached, path = trained(tmp_path)
     ages = reached.env.episode_length_buf.clone()
@@ -95,7 +108,7 @@ def test_running_episodes_of_a_whole_checkpoint_keep_their_ages(tmp_path):
     assert torch.equal(resumed.env.episode_length_buf, ages)
 
 
-def test_episodes_that_begin_anew_from_a_slim_checkpoint_have_random_ages(tmp_path):
+def test_episodes_that_begin_anew_from_a_slim_checkpoint_have_random_ages(trained, tmp_path):
     """Without them all worlds would time out at once, again and again."""
     _, path = trained(tmp_path, keep_episodes=False)
     resumed = build(seed=5, keep_episodes=True)
@@ -105,7 +118,7 @@ def test_episodes_that_begin_anew_from_a_slim_checkpoint_have_random_ages(tmp_pa
 
 
 @pytest.mark.parametrize("kept", ["whole", "slim", "of two processes"])
-def test_the_log_takes_over_running_episodes_where_they_run_on(tmp_path, kept):
+def test_the_log_takes_over_running_episodes_where_they_run_on(trained, tmp_path, kept):
     reached, path = trained(tmp_path, keep_episodes=kept != "slim")
     length = reached.logger.episode_length
     assert bool((length > 0).any())
