@@ -2,19 +2,63 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 from ..backends.base import PhysicsBackend, Support
 from ..files.parsing import one_line, take
-from ..policy.contract import ASSUMED, ASSUMPTIONS, PHYSICS, PolicyContract
+from ..policy.contract import ASSUMED, ASSUMPTIONS, PHYSICS, PolicyContract, kind_of_observations
+from ..policy.native import FilePolicy
+from ..policy.robot_of import without_copy
 from ..robots import Robot
-from .result import CommandShares, Feet, TrainingPhysics
+from .motors import gains_note, joint_parameters
+from .result import CommandShares, Feet, Motors, PolicyName, TrainingPhysics
 from .suite import Suite
+from .suited import shares_beyond
+from .totals import number
 
 UNSTATED = "the policy's file does not say in which physics it was trained and tuned"
 _SLIDING, _TORSION = 3, 4
 """Contact dimensions without and with torsional friction."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Description:
+    """What a result says of policy, robot and physics, without a figure of the play."""
+
+    policy: PolicyName
+    robot: str
+    motors: Motors
+    training: TrainingPhysics
+    commands: CommandShares
+    feet: Feet
+    solver: Mapping[str, Any]
+
+
+def describe(
+    suite: Suite, robot: Robot, policy: FilePolicy, engine: type[PhysicsBackend], terrains: Collection[str]
+) -> Description:
+    """Return what a result says of a policy as a suite and an engine play it on a robot; ``terrains``: all that are played."""
+    contract = policy.contract
+    motors = joint_parameters(suite, robot, contract)
+    return Description(
+        policy=PolicyName(
+            path=policy.path,
+            contract_hash=contract.hash,
+            file_sha256=policy.file_sha256,
+            observations=tuple(term.name for term in contract.observation),
+            kind_of_observations=kind_of_observations(contract),
+            provenance=without_copy(contract.provenance),
+            assumptions=assumptions(contract),
+        ),
+        robot=robot.name,
+        motors=Motors(stiffness=motors.stiffness, damping=motors.damping, note=gains_note(suite, robot, contract)),
+        training=training_physics(contract),
+        commands=command_shares(suite, contract, terrains),
+        feet=played_feet(suite, robot, engine),
+        solver=dict(engine.solver_settings(suite.physics)),
+    )
 
 
 class _MalformedError(ValueError):
@@ -38,9 +82,11 @@ def assumptions(contract: PolicyContract) -> tuple[str, ...]:
     return tuple(one_line(entry, 1000) for entry in [*entries, *([text] if text else [])][:100])
 
 
-def command_shares(contract: PolicyContract, beyond: Mapping[Any, float] | None = None) -> CommandShares:
-    """Return a policy's command limits and the shares of commands ``beyond`` them, by axis, where the suite counts them."""
-    return CommandShares(limits=contract.command_limits, beyond=dict(beyond or {}))
+def command_shares(suite: Suite, contract: PolicyContract, terrains: Collection[str]) -> CommandShares:
+    """Return a policy's command limits and the shares of a suite's commands on some terrains that are beyond them."""
+    limits = contract.command_limits
+    shares = {axis: number(share) for axis, share in shares_beyond(suite, terrains, limits).items()}
+    return CommandShares(limits=limits, beyond=dict(shares))
 
 
 def played_feet(suite: Suite, robot: Robot, backend: type[PhysicsBackend]) -> Feet:

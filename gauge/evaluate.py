@@ -23,19 +23,17 @@ from ..files.choices import cpu_threads
 from ..files.parsing import one_line, shown
 from ..files.provenance import plugins, provenance, source_digest, versions
 from ..files.writing import json_text, write_atomically
-from ..policy.contract import kind_of_observations
 from ..policy.loading import load_policy
 from ..policy.native import FilePolicy
-from ..policy.robot_of import robot_for, without_copy
+from ..policy.robot_of import robot_for
 from ..robots import Robot, load_robot
 from ..robots.loading import robot_digest
 from ..terrains.registry import make_terrain, terrain_names
 from .coverage import coverage
-from .described import assumptions, command_shares, played_feet, training_physics
+from .described import describe
 from .episodes import QUALITY
 from .fit import check_fit
 from .goals import TARGET, check_terrain, count_sub_commands
-from .motors import gains_note, joint_parameters
 from .pipelines import PIPELINES, Environment, check_friction, check_payload, make_environments
 from .plan import Plan, PlanRules, environment_result, plan
 from .play.cluster import Cluster, ClusterError, ClusterWorkers, check_address
@@ -44,11 +42,11 @@ from .play.progress import ProgressMeter, Status
 from .play.segments import count_segments
 from .play.workers import Job, local_workers, start_workers
 from .request import Request
-from .result import ClusterName, Motors, PolicyName, Provenance, Result
+from .result import ClusterName, Provenance, Result
 from .results import fold, rows_csv
 from .store import RunFolder, StoreError
 from .suite import Suite, SuiteError, load_suite
-from .suited import shares_beyond, suited
+from .suited import suited
 from .totals import health_of
 
 _WORLDS = 24
@@ -241,32 +239,18 @@ def evaluate(
         outcomes = [environment_result(environment, store.records, rules) for environment in prepared.environments]
         counted = [record for outcome in outcomes for record in (*outcome.trials, *outcome.records)]
         scores = fold(suite, outcomes, (*suite.metrics.weights, QUALITY), evaluated=rules.quality)
-        contract, engine = prepared.policy.contract, find_backend(request.backend, prepared.device)
+        engine = find_backend(request.backend, prepared.device)
         digests = {"policy": prepared.policy.digest, "robot": robot_digest(prepared.robot)}
         digests |= {"suite": suite.digest, "source": source_digest()}
-        beyond = shares_beyond(suite, {e.terrain for e in prepared.environments}, contract.command_limits)
-        motors, note = joint_parameters(suite, prepared.robot, contract), gains_note(suite, prepared.robot, contract)
         result = Result(
             **vars(scores),
-            policy=PolicyName(
-                path=prepared.policy.path,
-                contract_hash=contract.hash,
-                file_sha256=prepared.policy.file_sha256,
-                observations=tuple(term.name for term in contract.observation),
-                kind_of_observations=kind_of_observations(contract),
-                provenance=without_copy(contract.provenance),
-                assumptions=assumptions(contract),
+            **vars(
+                describe(suite, prepared.robot, prepared.policy, engine, {e.terrain for e in prepared.environments})
             ),
             coverage=coverage(suite, prepared.environments, prepared.seeds, pipeline=request.pipeline),
             pipeline=request.pipeline,
             backend=request.backend,
-            robot=prepared.robot.name,
-            motors=Motors(stiffness=motors.stiffness, damping=motors.damping, note=note),
-            training=training_physics(contract),
-            commands=command_shares(contract, beyond),
-            feet=played_feet(suite, prepared.robot, engine),
             health=health_of(scores.environments),
-            solver=dict(engine.solver_settings(suite.physics)),
             provenance=Provenance(
                 **provenance(
                     command=command, device=prepared.device, threads=request.threads or count, digests=digests

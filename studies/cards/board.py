@@ -4,24 +4,29 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import jinja2
 
+from ...backends.base import BackendError
 from ...files.parsing import edited, one_line
 from ...files.writing import make_folder, write_atomically
 from ...gauge.chance.intervals import Evidence
 from ...gauge.report.pages import page_template
 from ...gauge.result import Result
 from ...gauge.suite import load_suite, suite_names
+from ...gauge.suited import suited
 from ...gauge.totals import environment_weights
 from ...policy.contract import PRIVILEGED_TERMS
 from ...policy.finding import shipped_policies
+from ...policy.loading import load_policy
+from ...policy.robot_of import robot_for
 from ..compare.comparison import load_result
 from ..naming import distinct_names
 from ..policies import file_digest
-from .verify import CardError, check_card
+from .verify import CardError, check_card, check_policy
 
 
 def write_board(folder: Path, page: Path) -> Path:
@@ -46,6 +51,16 @@ def write_board(folder: Path, page: Path) -> Path:
                 f"{suite.version} with {suite.digest[:12]}…; evaluate its policy again, or take the card away"
             )
         check_card(card, by_digest.get(named.digest), source)
+        if named.digest in by_digest and _ships(card):
+            policy = load_policy(card.policy.path)
+            with suppress(BackendError):  # an engine that is not here is asked by whoever replays the card
+                check_policy(
+                    card,
+                    suited(by_digest[named.digest], policy.contract),
+                    policy,
+                    robot_for(policy.contract, None),
+                    source,
+                )
     with edited(f"a card in '{one_line(folder)}'", CardError, jinja2.TemplateError):
         text = render_board(board_data(cards, folder))
     make_folder(page.parent, CardError)
@@ -99,6 +114,12 @@ def render_board(tables: Sequence[Mapping[str, Any]]) -> str:
     return page_template(__file__, "board.html.j2").render(tables=tables)
 
 
+def _ships(card: Result) -> bool:
+    """Return whether a card is of a policy that ships."""
+    path = card.policy.path
+    return path in shipped_policies() and file_digest(path) == card.policy.file_sha256
+
+
 def _interval(card: Result, together: int) -> tuple[float, float] | None:
     """Return the interval of a score that covers it together with those of the other cards of its table."""
     if card.score is None or not card.environments:
@@ -117,8 +138,7 @@ def _possible_ranks(entry: Mapping[str, Any], ranked: Sequence[Mapping[str, Any]
 def _entry(name: str, card: Result, folder: Path, policy: str) -> dict[str, Any]:
     """Return a line of the board."""
     terms, path = card.policy.observations, card.policy.path
-    ships = path in shipped_policies() and file_digest(path) == card.policy.file_sha256
-    found = ships or ((folder / name).parent / path).is_file()
+    found = _ships(card) or ((folder / name).parent / path).is_file()
     privileged = bool(set(terms or ()) & set(PRIVILEGED_TERMS))
     return {
         "card": name,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -12,21 +12,23 @@ from typing import Any
 import numpy as np
 
 from ...backends.base import BackendError
-from ...backends.registry import backend_class
+from ...backends.registry import engine_class
 from ...files.parsing import edited, one_line, shown
 from ...gauge.chance.intervals import Evidence
 from ...gauge.coverage import coverage
+from ...gauge.described import Description, describe
 from ...gauge.episodes import QUALITY
 from ...gauge.evaluate import Prepared, Request, Status, evaluate, prepare
 from ...gauge.goals import TARGET, command_name, count_sub_commands
 from ...gauge.pipelines import Environment
-from ...gauge.result import BY_HAND, UNKNOWN, Coverage, EnvironmentRow, Result, Run, Table, unlike
+from ...gauge.result import BY_HAND, CUSTOM, UNKNOWN, Coverage, EnvironmentRow, Result, Run, Table, unlike
 from ...gauge.results import chance_rules
 from ...gauge.suite import Suite, load_suite
 from ...gauge.totals import environment_weights
 from ...policy.finding import shipped_policies
+from ...policy.native import FilePolicy
 from ...policy.robot_of import REMEMBERED
-from ...robots import robot_names
+from ...robots import Robot, robot_names
 from ...robots.loading import robot_digest
 from ..policies import file_digest
 from .agreement import figures_that_are_off
@@ -118,16 +120,7 @@ def prepare_replay(
             contract=contract,
         )
     )
-    stated, observed = card.policy.observations, [t.name for t in prepared.policy.contract.observation]
-    if stated is not None and list(stated) != observed:
-        raise CardError(
-            f"the card says that the policy observes {shown(list(stated))}, its file says {shown(observed)}; the card was changed "
-            "by hand, so ask its maker for the results.json of the run"
-        )
-    if card.robot_digest not in (None, robot_digest(prepared.robot)):
-        raise CardError(
-            f"the files of robot '{card.robot}' are not the card's; check out the commit that made the card"
-        )
+    check_policy(card, prepared.suite, prepared.policy, prepared.robot, "the card")
     prepared = replace(prepared, environments=tuple(_environment(row) for row in rows))
     return prepared if fresh is None else with_fresh_seeds(prepared, fresh)
 
@@ -158,7 +151,7 @@ def check_card(card: Result, suite: Suite | None, source: str) -> None:
         stated = card.coverage.kind
         environments = [_environment(row) for row in card.environments]
         held = coverage(suite, environments, rules.seeds, pipeline=card.pipeline)
-        if stated not in (held.kind, UNKNOWN):
+        if stated not in (held.kind, CUSTOM, UNKNOWN):
             raise CardError(
                 f"{source} calls itself {one_line(stated)}, but holds {one_line(held.text)} of {suite.name}; {BY_HAND}"
             )
@@ -171,9 +164,11 @@ def _check_suite_s(card: Result, suite: Suite, held: Coverage, source: str) -> N
     run = next((run for row in card.environments for run in row.runs.values()), None)
     goals = [goal.name for goal in suite.goals if goal.name != TARGET]
     commands = {command_name(goal, part) for goal in goals for part in range(count_sub_commands(suite, goal))}
+    # what of a suite was changed for a policy is no part of its matrix, and takes the card's rank
+    own = {name: card.coverage.to_data()[name] for name in ("kind", "text") if card.coverage.kind == CUSTOM}
     pairs: dict[str, tuple[Any, Any]] = {
         "suite.title": (card.suite.title, suite.title),
-        "coverage": (card.coverage.to_data(), held.to_data()),
+        "coverage": (card.coverage.to_data(), held.to_data() | own),
         "group_metrics": (
             {g: list(m) for g, m in card.group_metrics.items()},
             {g: list(m) for g, m in suite.scoring.groups.items()},
@@ -183,7 +178,7 @@ def _check_suite_s(card: Result, suite: Suite, held: Coverage, source: str) -> N
         pairs["the list of metrics"] = (sorted(run.columns), sorted([*suite.metrics.weights, QUALITY]))
         pairs["the list of sub-commands"] = (sorted(run.commands), sorted(commands))
     with suppress(BackendError):  # an engine that is not here is asked by whoever replays the card
-        pairs["solver"] = (dict(card.solver), dict(backend_class(card.backend).solver_settings(suite.physics)))
+        pairs["solver"] = (dict(card.solver), dict(engine_class(card.backend).solver_settings(suite.physics)))
     for name, (stated, expected) in pairs.items():
         if stated != expected:
             raise CardError(
@@ -277,12 +272,7 @@ def judge(card: Result, replay: Result, *, fresh: bool = False) -> dict[str, Any
         interval = Evidence([new for _, new in pairs], replay.chance).chance(weights).interval(score)
     band = tolerance_band(score, interval)
     within = band is not None and here is not None and band[0] <= here and (fresh or here <= band[1])
-    asked, used = _settings(card), _settings(replay)
-    settings = [
-        {"name": name, "card": asked.get(name), "here": used.get(name)}
-        for name in ({**asked, **used} if card.proved else asked)
-        if asked.get(name) != used.get(name)
-    ]
+    settings = _unlike_settings(card, replay)
     return {
         "holds": not settings and not figures and not edited and (same or within),
         "equal": equal,
@@ -339,21 +329,50 @@ def _says_other(stated: Any, found: Any, *, by: float = 1e-4) -> bool:
     return stated is not None and stated != found
 
 
-def _settings(result: Result) -> dict[str, Any]:
+def _settings(result: Result | Description, lacking: Collection[str] = ()) -> dict[str, Any]:
     """Return what was played, with what and by which policy, as far as the result states it, as plain data by name."""
     policy = result.policy.to_data()
     found: dict[str, Any] = {}
     for name in ("motors", "feet", "commands", "training"):
-        if name not in result.lacking:
+        if name not in lacking:
             found |= {f"{name}.{key}": value for key, value in getattr(result, name).to_data().items() if value != []}
     found |= {f"solver.{name}": value for name, value in result.solver.items()}
     found |= {
         f"policy.{name}": policy[name]
-        for name in ("contract_hash", "kind_of_observations", "assumptions")
+        for name in ("contract_hash", "file_sha256", "observations", "kind_of_observations", "assumptions")
         if name in policy
     }
     origin = {f"policy.provenance.{k}": v for k, v in result.policy.provenance.items() if k not in _OF_THE_PLACE}
-    return found | origin | {"robot": result.robot, "backend": result.backend}
+    return found | origin | {"robot": result.robot}
+
+
+def _unlike_settings(card: Result, used: Result | Description) -> list[dict[str, Any]]:
+    """Return ``name``, ``card`` and ``here`` of each setting that is not the card's; schema 2 may state fewer."""
+    asked, here = _settings(card, card.lacking), _settings(used)
+    names = {**asked, **here} if card.proved else asked
+    return [
+        {"name": name, "card": asked.get(name), "here": here.get(name)}
+        for name in names
+        if asked.get(name) != here.get(name)
+    ]
+
+
+def check_policy(card: Result, suite: Suite, policy: FilePolicy, robot: Robot, source: str) -> None:
+    """Check what a card says of its policy, robot and physics against the policy's file.
+
+    Raises:
+        CardError: the file says otherwise, or the robot is another one.
+        BackendError: the card's engine is not here.
+    """
+    terrains = {row.terrain for row in card.environments}
+    for item in _unlike_settings(card, describe(suite, robot, policy, engine_class(card.backend), terrains)):
+        raise CardError(
+            f"{source}: {item['name']} is {shown(item['card'])}, but its policy and suite give {shown(item['here'])}; {BY_HAND}"
+        )
+    if card.robot_digest not in (None, robot_digest(robot)):
+        raise CardError(
+            f"{source}: the files of robot '{card.robot}' are not the card's; check out the commit that made the card"
+        )
 
 
 def tolerance_band(score: float | None, interval: Sequence[float] | None) -> list[float] | None:

@@ -53,15 +53,17 @@ def test_a_card_holds_where_it_was_made_and_an_edited_one_does_not(run, refused,
     forged["solver"]["iterations"] += 1
     path.write_text(json.dumps(forged))
     assert "solver is" in refused("verify", path, *options, "--quick")
-    forged["solver"] = content["solver"]
+    forged = json.loads(json.dumps(content))
     forged["motors"]["damping"][0] += 1.0
+    path.write_text(json.dumps(forged))
+    assert "motors.damping is [" in refused("verify", path, *options, "--quick")
+
+    forged = json.loads(json.dumps(content))
     forged["provenance"]["versions"]["mujoco"] = "3.0.0"
     path.write_text(json.dumps(forged))
     done = run("verify", path, *options, "--quick", "--out", tmp_path / "again")
     words = " ".join(done.stdout.split())
-    assert done.exit_code == 1 and "card and replay were made with other versions: mujoco 3.0.0 and" in words
-    assert "motors.damping: [" in words
-    assert "does NOT hold: it says of policy or physics what is not so here" in words
+    assert done.exit_code == 0 and "card and replay were made with other versions: mujoco 3.0.0 and" in words
 
     forged = json.loads(json.dumps(content))
     forged["environments"][0]["falls"] += 1
@@ -85,7 +87,7 @@ def test_a_card_holds_where_it_was_made_and_an_edited_one_does_not(run, refused,
     told = content["policy"]["observations"]
     content["policy"]["observations"] = told[1:]
     path.write_text(json.dumps(content))
-    assert "the card says that the policy observes" in refused("verify", path, *options)
+    assert "policy.observations is [" in refused("verify", path, *options)
     content["policy"] |= {"observations": told, "file_sha256": "ab" * 32}
     path.write_text(json.dumps(content))
     assert "another policy than the card's" in refused("verify", path, *options)

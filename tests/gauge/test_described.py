@@ -38,8 +38,9 @@ def test_assumptions_of_importers_are_sentences():
 
 
 def test_shares_beyond_the_limits_stand_beside_these():
-    found = command_shares(contract(), {"yaw": 0.25})
-    assert found.limits == GO2.command_limits and found.beyond == {"yaw": 0.25}
+    slow = replace(contract(), command_limits=(100.0, 100.0, 0.1))
+    found = command_shares(load_suite("demo"), slow, ["flat"])
+    assert found.limits == (100.0, 100.0, 0.1) and dict(found.beyond) == {"yaw": 1.0}
 
 
 @pytest.mark.parametrize(("asked", "dimension"), [(None, 6), (3, 3), (4, 4)])
