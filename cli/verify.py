@@ -66,7 +66,9 @@ def _print_verification(console: Terminal, found: Mapping[str, Any], asked: Veri
         verdict = "does NOT hold: it says of policy or physics what is not so here"
     elif found["edited"]:
         same, runs = found["runs"]
-        verdict = f"does NOT hold: {same} of {runs} runs are the same, but not all in {_listed(found['edited'])}"
+        verdict = (
+            f"does NOT hold: {same} of {runs} runs came out here as well, but not all of {_listed(found['edited'])}"
+        )
     elif found["figures"]:
         verdict = f"does NOT hold: chance does not explain its {_listed(found['figures'])}"
         if found["runs"][0] == found["runs"][1]:

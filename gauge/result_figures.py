@@ -92,7 +92,7 @@ def _pairs(stated: Any, expected: Any, name: str, proved: bool) -> Iterator[Figu
     """Yield the figures of two tables of one kind, side by side; schema 2 may lack some, and says some of which it holds nothing."""
     if isinstance(expected, Table) and isinstance(stated, Table):
         unknown = set() if proved else _UNKNOWN.get(name.partition("[")[0], set())
-        for key in expected.entries():
+        for key in {**expected.entries(), **stated.entries()}:
             if key not in stated.lacking | unknown:
                 yield from _pairs(getattr(stated, key), getattr(expected, key), f"{name}.{key}", proved)
     elif isinstance(expected, Mapping) and isinstance(stated, Mapping):

@@ -262,7 +262,7 @@ def judge(card: Result, replay: Result, *, fresh: bool = False) -> dict[str, Any
     equal = same and not (
         whole and any(_says_other(stated.get(name), getattr(replay, name), by=0.0) for name in _SCORES)
     )
-    # a processor of another kind changes nearly all runs where the robot moves
+    # a processor of another kind changes nearly all runs where the robot moves, and no run comes back in another place
     edited = [] if fresh or 2 * same_runs <= runs else [_place(row) for row in other]
     score, interval, here = card.score, None, replay.score
     if score is not None:
@@ -305,9 +305,20 @@ def _differs(stated: Mapping[str, Any], found: Mapping[str, Any], *, by: float) 
 
 
 def _count_runs(pairs: Sequence[tuple[EnvironmentRow, EnvironmentRow]]) -> tuple[int, int]:
-    """Return the number of runs that the card has, and of those that are the same here."""
-    runs = [(old, new.runs.get(seed)) for row, new in pairs for seed, old in row.runs.items()]
-    return len(runs), sum(new is not None and not _says_other(old, new, by=_SAME) for old, new in runs)
+    """Return the number of runs that the card has, and of those that came out here: in half of their figures, or elsewhere."""
+    here = {tuple(_figures_of(run)) for _, new in pairs for run in new.runs.values()}
+    count = same = 0
+    for row, new in pairs:
+        for seed, run in row.runs.items():
+            mine, other = _figures_of(run), _figures_of(new.runs[seed]) if seed in new.runs else []
+            count += 1
+            same += tuple(mine) in here or 2 * sum(a == b for a, b in zip(mine, other, strict=False)) >= len(mine)
+    return count, same
+
+
+def _figures_of(run: Run) -> list[float]:
+    """Return mean@50 of all columns and sub-commands of a run, up to rounding."""
+    return [round(value, 5) for table in (run.columns, run.commands) for _, value in sorted(table.items())]
 
 
 def _says_other(stated: Any, found: Any, *, by: float = 1e-4) -> bool:

@@ -36,10 +36,12 @@ def shifted(result, by, rows=None):
     """Return a result as another kind of processor would find it: every run differs, its quality by so much more or less."""
 
     def moved(run, at):
-        change = by + 2e-4 * (-1) ** at
-        tables = ({**table, "quality": table["quality"] + change} for table in (run.columns, run.mean, run.mean25))
-        columns, mean, mean25 = tables
-        return replace(run, columns=columns, mean=mean, mean25=mean25)
+        noise = 2e-4 * (-1) ** at
+        tables = (run.columns, run.mean, run.mean25, run.commands)
+        columns, mean, mean25, commands = ({k: min(v + noise, 1.0) for k, v in table.items()} for table in tables)
+        for table in (columns, mean, mean25):
+            table["quality"] += by
+        return replace(run, columns=columns, mean=mean, mean25=mean25, commands=commands)
 
     chosen = range(len(result.environments)) if rows is None else rows
     return made_of(
