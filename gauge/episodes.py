@@ -21,6 +21,8 @@ _LARGEST = 10**9
 """Bytes that a record unpacks to at most; an episode has some hundred kilobytes."""
 QUALITY = "quality"
 """Column of the sample table that holds the quality of each sample."""
+MOTION = "motion_done"
+"""Metric with the share of the commanded motion that a sample does; a suite that lists it multiplies a goal's quality by its mean."""
 
 
 class RecordError(ValueError):

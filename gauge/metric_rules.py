@@ -4,11 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 
 from pydantic import Field
 
 from ..files.parsing import NotNegative, Positive, Share, Text
+
+GO2_MASS, GO2_LEG = 15.2064, 0.426
+"""Mass [kg] and leg length [m] of the robot that scales are stated for."""
+
+
+class RobotScales(NamedTuple):
+    """Factors on scales that are stated for the Go2."""
+
+    force: float = 1.0
+    torque: float = 1.0
+    power: float = 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,6 +42,9 @@ class Metrics:
     """RMS joint power that scores zero [W]."""
     torque_scale: Positive
     """RMS torque difference that scores zero [N·m]."""
+    measure: Literal["fixed", "robot"] = "fixed"
+    """``fixed``: these scales and the force of pushes hold for every robot; ``robot``: they are the Go2's, and grow with a robot's
+    mass m and leg length l: pushes by m, torque by m l, power by m √l."""
     soft_limit: Annotated[float, Field(gt=0.0, le=1.0)]
     """Share of each joint range, around its middle, inside which no limit is exceeded."""
     soft_limit_joints: Annotated[tuple[Text, ...], Field(min_length=1, max_length=100)]

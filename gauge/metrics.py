@@ -22,7 +22,8 @@ from ..files.plugins import guarded, load_plugin, origin, plugins
 from ..robots.base import Robot
 from ..robots.body_plan import LEG_PARTS, body_plan, joint_ranges, stance_span
 from ..robots.rotation import projected_gravity, rotate_inverse
-from .metric_rules import Metrics
+from .episodes import MOTION
+from .metric_rules import GO2_LEG, GO2_MASS, Metrics, RobotScales
 
 GROUP = "gaitgauge.metrics"
 
@@ -161,6 +162,21 @@ def friction_margin(
     return (counted * slack).sum(1) / (counted.sum(1) + 1e-12)
 
 
+def motion_done(velocity: torch.Tensor, command: torch.Tensor, limits: torch.Tensor) -> torch.Tensor:
+    """Return the part of a velocity along the command, as a share of the command; NaN where nothing is commanded, (N,).
+
+    All three are taken as shares of the limits, so that metres and radians add up: v · v* / ‖v*‖².
+
+    Args:
+        velocity: forward, lateral [m/s] and yaw rate [rad/s] in the body frame, (N, 3).
+        command: commanded values of the same, (N, 3).
+        limits: command limits, (N, 3).
+    """
+    done, asked = velocity / limits, command / limits
+    size = (asked**2).sum(1)
+    return torch.where(size > 1e-9, (done * asked).sum(1) / size, torch.full_like(size, math.nan))
+
+
 def quality(values: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
     """Return the weighted geometric mean of the metrics of a sample, each clamped to [1e-9, 1] (gauge protocol §6.3).
 
@@ -226,6 +242,15 @@ class MetricConstants:
         middle, full = ranges.mean(1), ranges[:, 1] - ranges[:, 0]
         soft = 0.5 * rules.soft_limit * full
         return torch.tensor(watched, device=self.device), middle - soft, middle + soft, full
+
+    @cached_property
+    def scales(self) -> RobotScales:
+        """Return the factors on scales that are stated for the Go2."""
+        if self.rules.measure == "fixed":
+            return RobotScales()
+        plan = body_plan(self.robot)
+        heavier, longer = plan.mass / GO2_MASS, plan.leg_length / GO2_LEG
+        return RobotScales(force=heavier, torque=heavier * longer, power=heavier * math.sqrt(longer))
 
     @cached_property
     def span(self) -> float:
@@ -304,6 +329,12 @@ def _angular_velocity(at: Instants) -> torch.Tensor:
     return angular_velocity(at.state.base_quaternion_w, at.state.base_angular_velocity_b, at.command, scale, kind)
 
 
+def _motion_done(at: Instants) -> torch.Tensor:
+    state = at.state
+    linear = rotate_inverse(state.base_quaternion_w, state.base_linear_velocity_w)[:, :2]
+    return motion_done(torch.cat((linear, state.base_angular_velocity_b[:, 2:]), dim=1), at.command, at.limits)
+
+
 def _joint_limits(at: Instants) -> torch.Tensor:
     joints, *limits = at.constants.limits
     return joint_limits(at.state.joint_position[:, joints], *limits)
@@ -351,7 +382,11 @@ METRICS: Mapping[str, Metric] = {
         prepare=lambda constants: constants.limits,
     ),
     "dof_power": Metric(
-        function=lambda at: joint_power(at.state.joint_torque, at.state.joint_velocity, at.constants.rules.power_scale),
+        function=lambda at: joint_power(
+            at.state.joint_torque,
+            at.state.joint_velocity,
+            at.constants.rules.power_scale * at.constants.scales.power,
+        ),
         state=("joint_torque", "joint_velocity"),
         label="joint power",
         group="safety",
@@ -365,7 +400,10 @@ METRICS: Mapping[str, Metric] = {
     ),
     "torque_smoothness": Metric(
         function=lambda at: torque_smoothness(
-            at.state.joint_torque, at.torque_before, at.torque_known, at.constants.rules.torque_scale
+            at.state.joint_torque,
+            at.torque_before,
+            at.torque_known,
+            at.constants.rules.torque_scale * at.constants.scales.torque,
         ),
         state=("joint_torque",),
         label="torque smoothness",
@@ -384,6 +422,11 @@ METRICS: Mapping[str, Metric] = {
         state=("foot_normal_force", "foot_tangential_force"),
         label="friction margin",
         group="quality",
+    ),
+    MOTION: Metric(
+        function=_motion_done,
+        state=("base_quaternion_w", "base_linear_velocity_w", "base_angular_velocity_b"),
+        label="motion done",
     ),
 }
 """The metrics of the project."""

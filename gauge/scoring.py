@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from .episodes import Record
+from .episodes import MOTION, QUALITY, Record
 
 Array = NDArray[np.float64]
 
@@ -29,21 +29,33 @@ def tail_means(samples: Array) -> Array:
 
 
 def run_statistics(record: Record, column: int) -> Array:
-    """``tail_means`` of one column averaged over the goals of an episode, (3,). A goal without samples counts zero."""
+    """``tail_means`` of one column averaged over the goals of an episode, (3,). A goal without samples counts zero.
+
+    The quality of a goal counts for the share of the commanded motion that is done, where the suite measures it.
+    """
     goals = range(len(record.episode.goals))
     if len(record.samples) == 0:
         return np.zeros(3)
-    values = record.samples[:, column].astype(np.float64)
-    return np.mean([tail_means(values[record.goal_index == g]) for g in goals], axis=0)
+    return np.mean([_statistics(record, column, record.goal_index == g) for g in goals], axis=0)
 
 
 def command_statistics(record: Record, column: int) -> dict[tuple[int, int], Array]:
     """``tail_means`` of one column over the samples of each sub-command that was played, (3,), by goal and sub-command index."""
     parts = np.stack((record.goal_index, record.part_index), axis=1)
     return {
-        (goal, part): tail_means(record.samples[(parts == (goal, part)).all(1), column].astype(np.float64))
+        (goal, part): _statistics(record, column, (parts == (goal, part)).all(1))
         for goal, part in np.unique(parts, axis=0).tolist()
     }
+
+
+def _statistics(record: Record, column: int, mine: NDArray[np.bool_]) -> Array:
+    """Return ``tail_means`` of one column over some samples; those of the quality times the mean of ``MOTION``."""
+    samples = record.samples[mine].astype(np.float64)
+    found = tail_means(samples[:, column])
+    if MOTION not in record.columns or record.columns[column] != QUALITY:
+        return found
+    done = samples[:, record.columns.index(MOTION)]
+    return found if np.isnan(done).all() else found * tail_means(done)[0]
 
 
 class LevelWeights(Protocol):

@@ -84,6 +84,11 @@ class Matrix:
     """Seeds of the quality episodes."""
     search_seeds: Annotated[tuple[Seed, ...], Field(min_length=1, max_length=1000)]
     """Seeds of the level test."""
+    foot_torsion: Annotated[
+        tuple[Annotated[float, Field(ge=0.0, le=10.0)], ...], Field(min_length=1, max_length=10)
+    ] = (1.0,)
+    """Factors on the feet's torsional and rolling friction; the sub-commands and level tests of an environment take them in turn
+    (``play/feet.py``). Feet that only slide, in the robot's model or in an engine, have neither."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -196,7 +201,7 @@ class Push:
     duration: _Time
     """[s]."""
     force: tuple[_Force, _Force]
-    """Smallest and largest force, all between equally likely [N]."""
+    """Smallest and largest force, all between equally likely [N]; ``metrics.measure`` says for which robot."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -267,11 +272,13 @@ class Suite:
 
 
 _ADDED: Mapping[str, Any] = {
+    "matrix.foot_torsion": (1.0,),
     "physics.torque_speed_limit": False,
     "noise.projected_gravity": 0.0,
     "noise.base_linear_velocity": 0.0,
     "metrics.foot_force": 0.0,
     "metrics.flight": "left-out",
+    "metrics.measure": "fixed",
     "scoring.level": "bisection",
     "scoring.bracket_seeds": 2,
     "gains": "suite",
@@ -433,7 +440,7 @@ def _check(suite: Suite, source: str) -> None:
         rules[f"push.goal ({push.goal}) is none of goals with sub-commands ({', '.join(goals)})"] = any(
             g.name == push.goal and (g.phases or g.sub_commands) for g in suite.goals
         )
-    for name in ("terrains", "frictions", "payloads", "seeds", "search_seeds"):
+    for name in ("terrains", "frictions", "payloads", "seeds", "search_seeds", "foot_torsion"):
         values = getattr(matrix, name)
         rules[f"matrix.{name} has an entry twice: {shown(list(values))}"] = len(set(values)) == len(values)
     for one, among in (("nominal_friction", "frictions"), ("nominal_payload", "payloads")):

@@ -26,6 +26,9 @@ _SHRUNK = 0.5
 _USUAL = 0.1
 """Variance of one environment's level that is supposed beforehand, and counts as much as that of one environment."""
 
+_CAUTION = 1.12
+"""Factor on variances, which leaves false alarms of comparisons below 5 % and not at it."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class AreaSearch:
@@ -88,7 +91,7 @@ def area_variances(searches: Sequence[Mapping[int, Sequence[bool]]]) -> Array:
 
     That of a share p of n ≥ 2 trials is p (1 - p) / (n - 1). Levels with a single trial lie far from the crossing: those below it,
     of all searches, have one common share, and those above have another, which is too much rather than too little where they
-    differ. Half of an environment's variance is the mean of all.
+    differ. Half of an environment's variance is the mean of all, and all are a little larger than estimated.
 
     Args:
         searches: outcomes by level.
@@ -109,7 +112,7 @@ def area_variances(searches: Sequence[Mapping[int, Sequence[bool]]]) -> Array:
     share = passed / np.maximum(total, 1.0)
     own += singles @ (share * (1.0 - share) * total / np.maximum(total - 1.0, 1.0))
     mean = (own.sum() + _USUAL) / (len(own) + 1)
-    return (1.0 - _SHRUNK) * own + _SHRUNK * mean
+    return _CAUTION * ((1.0 - _SHRUNK) * own + _SHRUNK * mean)
 
 
 def redraw_areas(levels: Array, searches: Sequence[Mapping[int, Sequence[bool]]], noise: Array) -> Array:

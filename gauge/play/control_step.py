@@ -151,6 +151,7 @@ class ControlStep(ABC):
         force = None
         if pushed and suite.push is not None:
             force = find_push(buffers, self.backend.state, seen.command.commanded)
+            force = force if self.samples.push_scale == 1.0 else force * self.samples.push_scale
         return Motion(targets, force, plan)
 
     def move(self, seen: Seen, motion: Motion) -> None:

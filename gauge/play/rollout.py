@@ -27,6 +27,7 @@ from ..episodes import QUALITY, Episode, Record
 from ..goals import TARGET
 from ..suite import Suite
 from .control_step import ControlStep, CpuStep, GpuStep
+from .feet import foot_torsion, torsion_varies
 from .sampling import Samples
 from .segments import Segment, SegmentOutcome, SegmentQueue
 from .world_buffers import SegmentCounts
@@ -80,7 +81,8 @@ class Rollout:
         self._began: dict[int, int] = {}
         self._respawn: set[int] = set()  # worlds whose robots go to their spawn before the next step
         self._changed = self._launched = False
-        self._randomized: list[tuple[float, float] | None] = [None] * backend.num_worlds
+        self._randomized: list[tuple[float, float, float] | None] = [None] * backend.num_worlds
+        self._turning = torsion_varies(suite, backend)
         self.control_steps = 0
         """Control steps so far, each of all worlds."""
         self.physics_steps = 0
@@ -216,7 +218,7 @@ class Rollout:
             substeps = (max(sampled) + 2) * self.backend.scene.physics.substeps
             step.samples.reserve(math.ceil(substeps / suite.metrics.interval) + 2)
         step.samples.clear(step.buffers.mask(worlds))
-        self._randomize(worlds, episodes)
+        self._randomize(worlds, segments)
         if isinstance(self.backend, EpisodeAware):
             self.backend.assign(worlds, [f"{s.episode.key} {s.goal} {s.sub_command}" for s in segments])
         most = max(rules.most_steps(s) for s in segments)
@@ -234,13 +236,13 @@ class Rollout:
         self._respawn.difference_update(worlds)
         self._changed = True
 
-    def _randomize(self, worlds: list[int], episodes: Sequence[Episode]) -> None:
-        """Give worlds the friction and payload of their episodes, where they have others."""
+    def _randomize(self, worlds: list[int], segments: Sequence[Segment]) -> None:
+        """Give worlds the friction, payload and feet of their segments, where they have others."""
         wanted = {
-            world: (e.friction, e.payload)
-            for world, e in zip(worlds, episodes, strict=True)
-            if self._randomized[world] != (e.friction, e.payload)
+            world: (s.episode.friction, s.episode.payload, foot_torsion(self.suite, s) if self._turning else 1.0)
+            for world, s in zip(worlds, segments, strict=True)
         }
+        wanted = {world: values for world, values in wanted.items() if self._randomized[world] != values}
         if not wanted:
             return
         mask, device, dtype = self._step.buffers.mask(list(wanted)), self.backend.device, self.backend.dtype
@@ -248,10 +250,14 @@ class Rollout:
         # a mass changes constants that an engine has to work out anew
         present = [self._randomized[world] for world in wanted]
         heavier = any(old is None or old[1] != new[1] for old, new in zip(present, wanted.values(), strict=True))
-        change = Randomization(friction=values[:, 0], base_mass_offset=values[:, 1] if heavier else None)
+        change = Randomization(
+            friction=values[:, 0],
+            base_mass_offset=values[:, 1] if heavier else None,
+            foot_torsion=values[:, 2] if self._turning else None,
+        )
         self.backend.randomize(change, mask)
-        for world, pair in wanted.items():
-            self._randomized[world] = pair
+        for world, triple in wanted.items():
+            self._randomized[world] = triple
 
     def _policy_error(self, world: int) -> PolicyError:
         """Return the error of a policy that answered a finite observation with something else."""

@@ -39,6 +39,7 @@ class SampleTable:
         worlds, device, dtype = len(like.joint_position), like.joint_position.device, like.joint_position.dtype
         self._metrics = MetricEvaluator(suite.metrics, robot, weight, device, dtype)
         self.names = self._metrics.names
+        self.push_scale = self._metrics.constants.scales.force
         self._self_contact = SelfContact(robot)
         self._between_samples = suite.metrics.smoothness == "samples"
         joints = robot.num_joints

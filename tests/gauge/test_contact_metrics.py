@@ -186,9 +186,9 @@ def test_flight_neither_raises_nor_lowers_what_contacts_say():
 
 def test_segments_stand_in_for_themselves_alone_in_flight():
     metrics = evaluator(OWN)
-    values = torch.full((4, 8), 0.5)
-    values[1, 6:] = values[3, 6:] = math.nan
-    values[2, 6:] = 0.9
+    values = torch.full((4, 9), 0.5)
+    values[1, 6:8] = values[3, 6:8] = math.nan
+    values[2, 6:8] = 0.9
     together = metrics.with_quality(values, torch.ones(4, dtype=torch.bool), [2, 2])
     apart = [metrics.with_quality(v, torch.ones(2, dtype=torch.bool), [2]) for v in values.split(2)]
     assert torch.equal(together[:, -1], torch.cat(apart)[:, -1])

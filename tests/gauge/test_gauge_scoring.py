@@ -214,7 +214,7 @@ def test_the_score_of_an_expected_level_lies_between_those_of_the_levels_beside_
     names = [*suite.metrics.weights, "quality"]
     halves = {"goals": [0, 0, 1, 1], "parts": [0, 1, 0, 1], "terrain": "wave"}
     low, high = (
-        [record(np.full((4, 9), q + 0.02 * (seed - 1)), **halves, seed=seed, level=at) for seed in range(3)]
+        [record(np.full((4, len(names)), q + 0.02 * (seed - 1)), **halves, seed=seed, level=at) for seed in range(3)]
         for at, q in ((5, 0.6), (6, 0.4))
     )
     environment = replace(flat_environment([], 0.6, "wave", 5.25, True), records=[*low, *high])

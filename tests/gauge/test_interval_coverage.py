@@ -71,7 +71,7 @@ def test_a_policy_that_is_better_is_told_apart():
 
 def test_lapses_neither_shift_the_score_nor_leave_the_interval():
     """One failure in five trials at easy levels: as much as 24 evaluations can tell; the slow test has all shapes."""
-    found = bench.judge_shape("lapses of 20 %", 12, environments=4)
+    found = bench.judge_shape("lapses of 20 %", 12, seed=11, environments=4)
     assert abs(found.bias) < 0.008
     assert found.covered >= 0.8
     assert found.trials < 1.2 * found.before

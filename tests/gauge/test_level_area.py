@@ -73,7 +73,7 @@ def test_variances_are_those_of_the_levels_found():
         {level: table[level - 1, :count].tolist() for level, count in s.seeds.items()}
         for s, table in zip(searches, tables, strict=True)
     ]
-    assert area_variances(trials).mean() == pytest.approx((off**2).mean(), rel=0.15)
+    assert 0.97 < area_variances(trials).mean() / (off**2).mean() < 1.3
 
 
 def test_an_environment_without_a_surprise_is_not_certain():
@@ -124,5 +124,5 @@ def test_what_is_required_once_stays_counted_and_was_possible_before():
 
 def test_a_robot_that_stands_plays_few_trials_and_no_quality():
     records, _ = play(WAVE, RULES, lambda _: False)
-    assert len(records) == 6 + 3 + 2 + 7
+    assert len(records) == 7 + 3 + 2 + 7
     assert environment_result(WAVE, records, RULES).level == 0.0

@@ -1,0 +1,369 @@
+"""Whether a policy scores more on ``gaitgauge-1`` by doing less than is asked: its commands are filtered before it sees them.
+
+    python benchmarks/cheats.py pretrained --folder /tmp/cheats --threads 32 --filters 200 --fresh 20
+
+Seven terrains at one level, frictions 0.3, 0.6 and 0.9. Listed cheats (slower, capped along an axis, later, turning less, standing
+between) are played on the first five of the fresh seeds. Random filters are played on one seed each; the ten best of them are
+played again on the fresh seeds, which no choice has seen. A gain is the score with the filter minus the score without it, on the
+same seeds. Lower bounds are Student's over seeds, 95 % one-sided, with Holm's correction among the filters of a table.
+
+A listed cheat may gain at most 0.002 at any terrain and friction, and no lower bound may be above 0 where the unfiltered policy does
+not fall; nor may that of a random filter. Else the exit code is 1. What the folder holds is not played again. With 32 cores it takes
+about 10 minutes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import multiprocessing
+import sys
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from gaitgauge.backends import make_backend
+from gaitgauge.gauge.episodes import QUALITY, Episode
+from gaitgauge.gauge.evaluate import Prepared, Request, prepare
+from gaitgauge.gauge.goals import TARGET
+from gaitgauge.gauge.play.rollout import Rollout
+from gaitgauge.gauge.play.workers import Job
+from gaitgauge.gauge.scoring import level_score, run_statistics
+from gaitgauge.policy.observation import ObservationBuilder
+from scipy import special
+
+FRICTIONS = (0.3, 0.6, 0.9)
+_FRESH, _SCREEN = 9000, 8000
+"""First of the fresh seeds, and the seed of the screen."""
+_CHUNK = 5
+"""Seeds of one job."""
+_LISTED_SEEDS, _BEST = 5, 10
+_ALLOWED = 0.002
+"""Gain that a listed cheat may have at a terrain and friction."""
+_MEAN50 = 2
+
+
+@dataclass(frozen=True, kw_only=True)
+class Filter:
+    """A change of the command that a policy sees."""
+
+    name: str
+    scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    """Factors on forward, lateral and yaw speed."""
+    cap: tuple[float, float, float] = (math.inf, math.inf, math.inf)
+    """Largest absolute values [m/s, m/s, rad/s]."""
+    delay: float = 0.0
+    """[s]."""
+    lag: float = 0.0
+    """Time constant of a first-order lag [s]."""
+    walk: float = math.inf
+    stand: float = 0.0
+    """Lengths of walking and of standing, in turns [s]."""
+
+
+LISTED = (
+    Filter(name="slower, 0.9", scale=(0.9, 0.9, 0.9)),
+    Filter(name="slower, 0.8", scale=(0.8, 0.8, 0.8)),
+    Filter(name="forward at most 0.7 m/s", cap=(0.7, math.inf, math.inf)),
+    Filter(name="sideways at most 0.7 m/s", cap=(math.inf, 0.7, math.inf)),
+    Filter(name="turning at most 1 rad/s", cap=(math.inf, math.inf, 1.0)),
+    Filter(name="0.3 s later", delay=0.3),
+    Filter(name="turning less, 0.7", scale=(1.0, 1.0, 0.7)),
+    Filter(name="standing between", walk=1.5, stand=0.3),
+)
+NONE = Filter(name="none")
+
+
+def random_filter(index: int) -> Filter:
+    """Return the random filter of a number: each kind of change is part of it with a chance of one half."""
+    generator = np.random.default_rng([7, index])
+
+    def some(values: Sequence[float], otherwise: float) -> tuple[float, float, float]:
+        drawn = [v if generator.random() < 0.5 else otherwise for v in values]
+        return drawn[0], drawn[1], drawn[2]
+
+    scale = some(generator.uniform(0.5, 1.0, 3).tolist(), 1.0)
+    cap = some((generator.uniform(0.4, 1.0, 3) * (1.0, 1.0, 1.5)).tolist(), math.inf)
+    delay, lag, walk, stand = generator.uniform((0.02, 0.05, 0.5, 0.1), (0.5, 1.0, 3.0, 0.6)).tolist()
+    parts = generator.random(3) < 0.5
+    return Filter(
+        name=f"random {index}",
+        scale=scale,
+        cap=cap,
+        delay=delay if parts[0] else 0.0,
+        lag=lag if parts[1] else 0.0,
+        walk=walk if parts[2] else math.inf,
+        stand=stand if parts[2] else 0.0,
+    )
+
+
+class FilteredBuilder:
+    """An observation builder that tells its policy filtered commands."""
+
+    def __init__(self, builder: ObservationBuilder, change: Filter, period: float) -> None:
+        self._builder, self._change, self._period = builder, change, period
+        worlds = builder.num_episodes
+        self._past = torch.zeros(worlds, round(change.delay / period) + 1, 3)
+        self._lagged = torch.zeros(worlds, 3)
+        self._step = torch.zeros(worlds, 1)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._builder, name)
+
+    def reset(self, episodes: torch.Tensor | None = None) -> None:
+        """Forget past commands of the masked worlds, (N,) bool, None for all."""
+        for memory in (self._past, self._lagged, self._step):
+            memory[... if episodes is None else episodes] = 0.0
+        self._builder.reset(episodes)
+
+    def build(self, state: Any, command: torch.Tensor, *arguments: Any) -> torch.Tensor:
+        """Return the observations of filtered commands."""
+        return self._builder.build(state, self.filtered(command.to(torch.float32)), *arguments)
+
+    def filtered(self, command: torch.Tensor) -> torch.Tensor:
+        """Return the commands that the policy is told in this control step, (N, 3)."""
+        change, period = self._change, self._period
+        cap = torch.tensor(change.cap)
+        told = torch.clamp(command * torch.tensor(change.scale), -cap, cap)
+        self._past = torch.cat((told[:, None], self._past[:, :-1]), 1)
+        told = self._past[:, -1]
+        if change.lag:
+            self._lagged += (told - self._lagged) * (period / (change.lag + period))
+            told = self._lagged.clone()
+        if change.stand:
+            walk, stand = round(change.walk / period), round(change.stand / period)
+            told = told * (self._step % (walk + stand) < walk)
+        self._step += 1.0
+        return told
+
+
+# ---- playing --------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class Play:
+    """Episodes of one filter on one terrain."""
+
+    change: Filter
+    terrain: str
+    seeds: tuple[int, ...]
+
+    @property
+    def key(self) -> str:
+        """Unique name."""
+        return f"{self.change.name} | {self.terrain} | {self.seeds[0]}-{self.seeds[-1]}"
+
+
+@dataclass
+class Scores:
+    """Scores and falls of what was played, by filter, terrain, friction and seed."""
+
+    found: dict[tuple[str, str, float, int], tuple[float, int]] = field(default_factory=dict)
+
+    def gain(self, change: str, terrain: str, friction: float, seeds: Sequence[int]) -> np.ndarray:
+        """Return the gains of a filter on some seeds, (S,)."""
+        return np.array(
+            [self.found[change, terrain, friction, s][0] - self.found["none", terrain, friction, s][0] for s in seeds]
+        )
+
+    def gains(self, change: str, terrains: Sequence[str], seeds: Sequence[int]) -> np.ndarray:
+        """Return the gains of a filter, the mean over terrains and frictions, by seed, (S,)."""
+        return np.mean([self.gain(change, t, f, seeds) for t in terrains for f in FRICTIONS], axis=0)
+
+    def falls(self, terrain: str, friction: float, seeds: Sequence[int]) -> int:
+        """Return the falls of the unfiltered policy."""
+        return sum(self.found["none", terrain, friction, s][1] for s in seeds)
+
+
+def play(prepared: Prepared, level: int, wanted: Play) -> list[list[Any]]:
+    """Play a job in this process; returns friction, seed, score and falls of each episode."""
+    torch.set_num_threads(1)
+    suite, flat = prepared.suite, wanted.terrain == "flat"
+    level = 0 if flat else level
+    goals = tuple(g.name for g in suite.goals if g.name != TARGET)
+    episodes = [
+        Episode(terrain=wanted.terrain, level=level, friction=f, payload=0.0, seed=s, stage="eval", goals=goals)
+        for f in FRICTIONS
+        for s in wanted.seeds
+    ]
+    job = Job(
+        suite=suite,
+        policy=prepared.policy,
+        robot=prepared.robot,
+        places=((wanted.terrain, level),),
+        worlds=42,
+        build=lambda scene, **options: make_backend(prepared.request.backend, scene, device="cpu", **options),
+    )
+    rollout = job.rollout()
+    _filter_commands(rollout, wanted.change, suite.physics.control_period)
+    rollout.play(episodes)
+    found = []
+    while not rollout.idle:
+        for record in rollout.advance():
+            quality = run_statistics(record, record.columns.index(QUALITY))[_MEAN50]
+            score = float(level_score(float(quality), level, suite.scoring, flat=flat))
+            found.append([record.episode.friction, record.episode.seed, score, record.falls])
+    rollout.backend.close()
+    return found
+
+
+def _filter_commands(rollout: Rollout, change: Filter, period: float) -> None:
+    step: Any = rollout._step  # no user of the gauge may change what a policy is told
+    step.builder = FilteredBuilder(step.builder, change, period)
+
+
+_shared: dict[str, Any] = {}
+"""What forked processes have from their parent."""
+
+
+def _play_shared(wanted: Play) -> tuple[Play, list[list[Any]]]:
+    return wanted, play(_shared["prepared"], _shared["level"], wanted)
+
+
+def play_all(wanted: Sequence[Play], folder: Path, threads: int, scores: Scores) -> None:
+    """Play what the folder does not hold, side by side, each job on disk as soon as it has ended; fill in ``scores``."""
+    path = folder / "played.jsonl"
+    done: dict[str, list[list[Any]]] = {}
+    if path.exists():
+        text = path.read_text()
+        whole = text[: text.rfind("\n") + 1]  # a killed run may have cut its last line
+        path.write_text(whole)
+        done = {row["key"]: row["episodes"] for row in map(json.loads, whole.splitlines())}
+    missing = [p for p in wanted if p.key not in done]
+    began = time.perf_counter()
+    if missing:
+        context = multiprocessing.get_context("fork")
+        with context.Pool(threads) as pool, path.open("a") as file:
+            for count, (each, episodes) in enumerate(pool.imap_unordered(_play_shared, missing), 1):
+                done[each.key] = episodes
+                file.write(json.dumps({"key": each.key, "episodes": episodes}) + "\n")
+                file.flush()
+                if count % 10 == 0 or count == len(missing):
+                    left = (time.perf_counter() - began) / count * (len(missing) - count)
+                    print(
+                        f"\r{count} of {len(missing)} jobs, {left:.0f} s left   ", end="", file=sys.stderr, flush=True
+                    )
+        print(file=sys.stderr)
+    for each in wanted:
+        for friction, seed, score, falls in done[each.key]:
+            scores.found[each.change.name, each.terrain, friction, seed] = score, falls
+
+
+def chunks(seeds: Sequence[int]) -> Iterator[tuple[int, ...]]:
+    """Yield the seeds of jobs."""
+    for begin in range(0, len(seeds), _CHUNK):
+        yield tuple(seeds[begin : begin + _CHUNK])
+
+
+# ---- judging --------------------------------------------------------------------------------------------------------
+
+
+def lower_bounds(gains: Mapping[str, np.ndarray]) -> dict[str, float]:
+    """Return 95 % one-sided lower bounds of mean gains, with Holm's correction: the k-th best of m at level 0.05 / (m + 1 - k).
+
+    Args:
+        gains: of each filter by seed, (S,).
+    """
+    found: dict[str, float] = {}
+    statistics = {
+        name: (g.mean(), g.std(ddof=1) / math.sqrt(len(g)), len(g) - 1) for name, g in gains.items() if len(g) > 1
+    }
+    order = sorted(statistics, key=lambda n: -statistics[n][0] / (statistics[n][1] + 1e-12))
+    for rank, name in enumerate(order):
+        mean, error, freedom = statistics[name]
+        found[name] = mean - float(special.stdtrit(freedom, 1.0 - 0.05 / (len(order) - rank))) * error
+    return found
+
+
+def judge_listed(scores: Scores, terrains: Sequence[str], seeds: Sequence[int]) -> bool:
+    """Print the table of the listed cheats; returns whether none of them pays."""
+    bounds = lower_bounds({f.name: scores.gains(f.name, terrains, seeds) for f in LISTED})
+    print(f"\n{'listed cheat':28}{'gain':>9}{'bound':>9}{'lost at':>9}{'most gained':>13}  where")
+    kept = True
+    for change in LISTED:
+        places = {(t, f): scores.gain(change.name, t, f, seeds).mean() for t in terrains for f in FRICTIONS}
+        place, most = max(places.items(), key=lambda item: item[1])
+        fell = {p for p in places if scores.falls(*p, seeds)}
+        by_place = {str(p): scores.gain(change.name, *p, seeds) for p in places if p not in fell}
+        kept &= most <= _ALLOWED and all(bound <= 0.0 for bound in lower_bounds(by_place).values())
+        where = f"{place[0]} {place[1]:g}{', falls unfiltered' if place in fell else ''}"
+        lost = sum(gain < 0 for gain in places.values())
+        mean = np.mean(list(places.values()))
+        print(f"{change.name:28}{mean:+9.4f}{bounds[change.name]:+9.4f}{lost:6}/{len(places)}{most:+13.4f}  {where}")
+    return kept
+
+
+def judge_random(scores: Scores, terrains: Sequence[str], best: Mapping[str, float], seeds: Sequence[int]) -> bool:
+    """Print the table of the best random filters, ``best`` with their gains in the screen; returns whether no bound is above 0."""
+    gains = {name: scores.gains(name, terrains, seeds) for name in best}
+    bounds = lower_bounds(gains)
+    print(f"\n{'random filter':28}{'screen':>9}{'fresh':>9}{'bound':>9}")
+    for name, screened in best.items():
+        print(
+            f"{name:28}{screened:+9.4f}{gains[name].mean():+9.4f}{bounds[name]:+9.4f}  {random_filter(_number(name))}"
+        )
+    return all(bound <= 0.0 for bound in bounds.values())
+
+
+def _number(name: str) -> int:
+    return int(name.rpartition(" ")[2])
+
+
+def main() -> int:
+    """Play, print the tables; returns 1 where a cheat pays."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("policy")
+    parser.add_argument("--folder", type=Path, required=True, help="what was played is kept there")
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--filters", type=int, default=200, help="random filters")
+    parser.add_argument("--fresh", type=int, default=20, help="seeds on which the ten best are played again")
+    parser.add_argument("--level", type=int, default=5, help="of the terrains that have levels")
+    parser.add_argument("--terrain", action="append", help="instead of all of the suite; more than once for several")
+    arguments = parser.parse_args()
+    arguments.folder.mkdir(parents=True, exist_ok=True)
+    prepared = prepare(Request(policy=arguments.policy, suite="gaitgauge-1", frictions=(0.6,), payloads=(0.0,)))
+    torch.set_num_threads(1)
+    identity = f"{prepared.policy.digest} {prepared.suite.digest} {arguments.level}"
+    stamp = arguments.folder / "played.txt"
+    if stamp.exists() and stamp.read_text() != identity:
+        parser.error(f"--folder {arguments.folder} holds another policy, suite or level; choose another folder")
+    stamp.write_text(identity)
+    _shared.update(prepared=prepared, level=arguments.level)
+    terrains = arguments.terrain or list(prepared.suite.matrix.terrains)
+    fresh = [_FRESH + s for s in range(max(arguments.fresh, _LISTED_SEEDS))]
+    few, scores = fresh[:_LISTED_SEEDS], Scores()
+
+    def plays(changes: Sequence[Filter], seeds: Sequence[int]) -> list[Play]:
+        return [Play(change=c, terrain=t, seeds=some) for c in changes for t in terrains for some in chunks(seeds)]
+
+    began = time.perf_counter()
+    candidates = [random_filter(index) for index in range(arguments.filters)]
+    play_all(
+        plays([NONE, *LISTED], few) + plays([NONE, *candidates], [_SCREEN]), arguments.folder, arguments.threads, scores
+    )
+    kept = judge_listed(scores, terrains, few)
+    if candidates:
+        screened = {c.name: float(scores.gains(c.name, terrains, [_SCREEN])[0]) for c in candidates}
+        best = dict(sorted(screened.items(), key=lambda item: -item[1])[:_BEST])
+        play_all(
+            plays([NONE, *(random_filter(_number(name)) for name in best)], fresh),
+            arguments.folder,
+            arguments.threads,
+            scores,
+        )
+        kept &= judge_random(scores, terrains, best, fresh)
+        print(
+            f"\nof {len(candidates)} random filters {sum(g > 0 for g in screened.values())} gained on the screen's seed"
+        )
+    suite, seconds = prepared.suite, time.perf_counter() - began
+    print(f"{'no cheat pays' if kept else 'a cheat pays'} on {suite.name} {suite.version}; {seconds:.0f} s")
+    return 0 if kept else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
