@@ -203,11 +203,11 @@ class _Session:
         if not found:
             raise JuryError(f"no engine could judge '{label}': {'; '.join(self._unable.values())}")
         physics, families = training_physics(loaded.policy.contract), prepared.families
-        homes = dict.fromkeys(_family(str(name)) for name in (*physics.trained, *physics.tuned))
+        homes = dict.fromkeys(_family(entry.engine) for entry in (*physics.trained, *physics.tuned))
         block = verdict(prepared.bench, found, families, list(homes), label)
         block |= {
             "policy": describe(label, loaded),
-            "training": {"trained": list(physics.trained), "tuned": list(physics.tuned), "note": physics.note},
+            "training": physics.to_data(),
         }
         block["unable"] = [{"engine": k, "reason": v} for k, v in self._unable.items()]
         return block | {"sentences": sentences(block, label)}

@@ -52,9 +52,9 @@ def brief(tmp_path, monkeypatch):
     return JuryRequest(policies=(standing(tmp_path / "standing.gauge.pt"),), engines=("fake", "fake@ls_iterations=7"))
 
 
-def standing(path, robot="go2"):
+def standing(path, robot="go2", contract=None):
     """Save a policy that never moves."""
-    contract = standard_contract(load_robot(robot))
+    contract = contract or standard_contract(load_robot(robot))
     arguments = {"frame_width": 45, "num_actions": 12, "hidden": [8]}
     zeros = {k: torch.zeros_like(v) for k, v in MlpNetwork(**arguments).state_dict().items()}
     save_policy(path, contract, StoredNetwork(architecture="mlp", arguments=arguments, state_dict=zeros))
@@ -114,6 +114,19 @@ def test_engines_that_differ_in_speed_are_told_apart(brief, tmp_path):
     assert any("disagree most" in sentence for sentence in block["sentences"])
     assert results == json.loads((tmp_path / "out" / "jury.json").read_text())
     assert "fake@ls_iterations=7" in write_page(tmp_path / "out").read_text()
+
+
+def test_physics_that_a_policy_was_trained_in_is_its_home(brief, tmp_path):
+    """A file that states an engine with its settings ended the jury with a traceback."""
+    physics = {"trained": [{"engine": "mujoco-warp", "settings": {"foot_condim": 6}}], "tuned": [{"engine": "other"}]}
+    contract = standard_contract(load_robot("go2"))
+    request = replace(
+        brief,
+        policies=(standing(tmp_path / "told.gauge.pt", contract=replace(contract, provenance={"physics": physics})),),
+    )
+    (block,) = judged(request, tmp_path / "out")["policies"]
+    assert block["home"] == ["MuJoCo", "other"]
+    assert block["training"]["trained"][0]["settings"] == {"foot_condim": 6}
 
 
 def test_a_jury_goes_on_where_it_stopped(brief, tmp_path):
