@@ -318,6 +318,11 @@ class PhysicsBackend(ABC):
         """Return one entry for each of ``CAPABILITY_NAMES``."""
 
     @classmethod
+    def forkable(cls) -> bool:
+        """Return whether a forked process can build worlds; False where the library is at work here and would not survive a fork."""
+        return True
+
+    @classmethod
     def solver_settings(cls, physics: PhysicsOptions) -> Mapping[str, float | str]:
         """Return the solver options in force, by name, for the results of a run with ``physics``.
 

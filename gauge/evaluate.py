@@ -18,7 +18,7 @@ from typing import Any
 
 import torch
 
-from ..backends.registry import choose_device, find_backend, make_backend
+from ..backends.registry import choose_device, engine_class, find_backend, make_backend
 from ..files.choices import cpu_threads
 from ..files.parsing import one_line, shown
 from ..files.provenance import plugins, provenance, source_digest, versions
@@ -234,7 +234,8 @@ def evaluate(
         store = stack.enter_context(RunFolder(folder, identity(prepared), resume=resume))
         plans = [planner(store.records) for planner in planners]
         job, count, speculation = _workers(prepared, plans, cluster)
-        with closing(cluster.workers(job, count) if cluster else start_workers(job, count)) as workers:
+        forked = engine_class(request.backend).forkable()
+        with closing(cluster.workers(job, count) if cluster else start_workers(job, count, forked=forked)) as workers:
             effort = play(planners, store.records, store.put, workers, speculation=speculation, watch=on_progress)
         outcomes = [environment_result(environment, store.records, rules) for environment in prepared.environments]
         counted = [record for outcome in outcomes for record in (*outcome.trials, *outcome.records)]

@@ -11,7 +11,7 @@ from ..base import Capability, PhysicsOptions
 from ..sequential import SequentialBackend, World
 from .limits import LIMITS
 from .usd import POSITION_ITERATIONS, SCENE_SETTINGS, VELOCITY_ITERATIONS
-from .world import PhysxWorld
+from .world import PhysxWorld, in_use
 
 
 class PhysxBackend(SequentialBackend):
@@ -22,6 +22,11 @@ class PhysxBackend(SequentialBackend):
     own_dry_friction: ClassVar[bool] = True
     precision: ClassVar[torch.dtype] = torch.float32
     limits: ClassVar[Mapping[str, Capability]] = LIMITS
+
+    @classmethod
+    def forkable(cls) -> bool:
+        """See ``PhysicsBackend.forkable``: the library's threads are not there in a forked process."""
+        return not in_use()
 
     @classmethod
     def solver_settings(cls, physics: PhysicsOptions) -> Mapping[str, float | str]:

@@ -57,6 +57,11 @@ def _prepare() -> None:
     ovstage.population.register_usd_schemas([str(path) for path in physx_schema_paths()])
 
 
+def in_use() -> bool:
+    """Return whether this process, or the one that it was forked from, has built worlds."""
+    return bool(_prepare.cache_info().currsize)
+
+
 class PhysxWorld(World):
     """See ``World``."""
 

@@ -12,6 +12,7 @@ one thread each keep two cores busy where one with two threads does not.
 from __future__ import annotations
 
 import gc
+import multiprocessing
 import os
 import pickle
 import signal
@@ -40,6 +41,7 @@ from ..motors import joint_parameters
 from ..suite import Suite
 from .rollout import Rollout
 
+_FRESH = multiprocessing.get_context("spawn")
 PROGRESS_INTERVAL = 0.2
 """Time between a worker's reports on how far it is [s]."""
 
@@ -215,9 +217,13 @@ class Worker:
         )
 
 
-def start_workers(job: Job, count: int) -> Transport:
-    """Workers on this machine: processes, or this process itself where there is one of them."""
-    return InProcess(job) if count == 1 else LocalProcesses(job, count)
+def start_workers(job: Job, count: int, *, forked: bool = True) -> Transport:
+    """Workers on this machine: processes, or this process itself where there is one of them.
+
+    Args:
+        forked: False for processes that start afresh, because the engine is not ``forkable``.
+    """
+    return InProcess(job) if count == 1 else LocalProcesses(job, count, CONTEXT if forked else _FRESH)
 
 
 def local_workers(backend: str, device: str, *, threads: int, most: int) -> int:
@@ -256,7 +262,7 @@ class InProcess:
 class LocalProcesses:
     """Several workers on this machine, one process and one pipe each."""
 
-    def __init__(self, job: Job, count: int) -> None:
+    def __init__(self, job: Job, count: int, context: Any = CONTEXT) -> None:
         self.count, self.worlds = count, job.worlds
         _ = job.scene  # made here, once
         self._processes: list[BaseProcess] = []
@@ -264,12 +270,13 @@ class LocalProcesses:
         self._open: dict[Connection, int] = {}  # workers that have not stopped
         try:
             for number in range(count):
-                ours, theirs = CONTEXT.Pipe()  # a forked worker has all modules and the policy at once
+                ours, theirs = context.Pipe()  # a forked worker has all modules and the policy at once
                 self._pipes.append(ours)
                 self._open[ours] = number
                 with theirs:
-                    arguments = (job, theirs, tuple(self._pipes))
-                    process = CONTEXT.Process(target=_run_worker, args=arguments, name=f"worker-{number}")
+                    inherited = tuple(self._pipes) if context.get_start_method() == "fork" else ()
+                    arguments = (job, theirs, inherited)
+                    process = context.Process(target=_run_worker, args=arguments, name=f"worker-{number}")
                     process.start()
                 self._processes.append(process)
         except BaseException:

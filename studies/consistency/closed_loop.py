@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from ...backends.registry import engine_class
 from ...gauge.episodes import QUALITY, Episode, Record
 from ...gauge.goals import TARGET
 from ...gauge.plan import Records, plan_list
@@ -124,7 +125,8 @@ def play_variant(
     def on_progress(dispatcher: Dispatcher) -> None:
         watch(meter.look(dispatcher.plans, dispatcher.active()))
 
-    with closing(start_workers(job, count)) as workers:
+    forked = engine_class(variant.backend).forkable()
+    with closing(start_workers(job, count, forked=forked)) as workers:
         play(plans, records, keep, workers, speculation=Speculation(), watch=on_progress)
 
 

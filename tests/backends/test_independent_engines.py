@@ -2,6 +2,8 @@
 
 import subprocess
 import sys
+from contextlib import closing
+from functools import partial
 from importlib.util import find_spec
 from itertools import product
 
@@ -10,6 +12,9 @@ from gaitgauge.backends import BackendError, PhysicsOptions, Scene, make_backend
 from gaitgauge.backends.conformance import Outcome, all_checks, make_bench, run_check
 from gaitgauge.backends.conformance.bench import FLAT
 from gaitgauge.backends.registry import engine_class, list_backends
+from gaitgauge.gauge.play.workers import Job, Progress, start_workers
+from gaitgauge.gauge.suite import load_suite
+from gaitgauge.policy.loading import load_policy
 from gaitgauge.robots import load_robot
 
 PACKAGES = {"drake": "pydrake", "physx": "ovphysx"}
@@ -67,3 +72,24 @@ def test_lists_import_no_engine():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.skipif("physx" not in INSTALLED, reason="PhysX is not installed; run `make test-jury`")
+def test_workers_start_afresh_after_physx_was_at_work_here():
+    with make_bench("physx").worlds() as worlds:
+        worlds.step()
+    forked = engine_class("physx").forkable()
+    assert not forked  # a forked process would end with a segmentation fault
+    job = Job(
+        suite=load_suite("jury"),
+        policy=load_policy("pretrained"),
+        robot=load_robot("go2"),
+        places=(("flat", 0),),
+        worlds=1,
+        build=partial(make_backend, "physx", device="cpu"),
+    )
+    with closing(start_workers(job, 2, forked=forked)) as workers:
+        said = dict(workers.receive())
+        while len(said) < 2:
+            said |= dict(workers.receive())
+    assert all(isinstance(message, Progress) for message in said.values()), said
