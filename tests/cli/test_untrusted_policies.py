@@ -55,8 +55,17 @@ def write(path: Path, module: nn.Module) -> Path:
     return path
 
 
-@pytest.mark.parametrize("kind", [InForward, InReset, InSetstate])
-@pytest.mark.parametrize("inside", [False, True])
+@pytest.mark.parametrize(
+    ("kind", "inside"),
+    [
+        (InForward, False),
+        (InReset, False),
+        (InSetstate, False),
+        (InForward, True),
+        pytest.param(InReset, True, marks=pytest.mark.slow),
+        pytest.param(InSetstate, True, marks=pytest.mark.slow),
+    ],
+)
 def test_no_command_opens_the_file(run, refused, tmp_path, contract, kind, inside):
     victim = tmp_path / "victim"
     path = write(tmp_path / "policy.pt", kind(str(victim)))

@@ -186,7 +186,7 @@ def test_marked_blocks_run(page, tmp_path):
                     [
                         "bash",
                         "-c",
-                        f"{shell}gaitgauge evaluate pretrained --suite demo --terrain flat --out {block.what}",
+                        f"{shell}gaitgauge evaluate pretrained --suite demo --terrain flat --no-clip --out {block.what}",
                     ]
                 )
             run([sys.executable, "-c", block.text] if block.kind == "python" else ["bash", "-c", shell + block.text])

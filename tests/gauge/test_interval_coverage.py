@@ -44,6 +44,7 @@ def test_many_synthetic_intervals_hold_the_truth(kind):
     assert 0.92 <= bench.coverage(kind, 600) <= 0.985
 
 
+@pytest.mark.slow
 def test_a_policy_is_hardly_ever_told_apart_from_itself(recorded):
     by_score, by_detail = bench.false_alarms("waves and obstacles, one friction", 100)
     assert by_score <= 0.05 and by_detail <= 0.07

@@ -55,7 +55,7 @@ def test_phases_follow_each_other_as_multiples_of_the_limits(suite_file):
     assert command_name("slalom", 1) == "slalom 2"
 
 
-@pytest.mark.parametrize("base", ["gaitgauge-1", "robogauge-1.1"])
+@pytest.mark.parametrize("base", ["gaitgauge-1", pytest.param("robogauge-1.1", marks=pytest.mark.slow)])
 def test_a_suite_with_goals_of_its_own_is_played_and_scored(suite_file, tmp_path, base):
     request = Request(policy="pretrained", suite=suite_file(base=base), pipeline="multi")
     result = evaluate(request, tmp_path / "run")

@@ -163,7 +163,7 @@ def test_replayed_steps_push_at_the_same_time_with_the_same_force(tapes, monkeyp
     assert sum(any(map(any, forces)) for forces in logs[0]) == 2
 
 
-@pytest.mark.parametrize("interval", [2, 4])
+@pytest.mark.parametrize("interval", [pytest.param(2, marks=pytest.mark.slow), 4])
 def test_steps_that_cannot_be_recorded_are_played_as_they_are(interval, tapes, monkeypatch, caplog):
     class Refusing(Recorder):
         def __exit__(self, *error):

@@ -171,7 +171,9 @@ def test_hostile_text_stays_text(place):
     assert not any(name.startswith("on") for _, attributes in page.tags for name in attributes)
 
 
-@pytest.mark.parametrize(("suite", "environments"), [("robogauge-1.1", 63), ("gaitgauge-1", 91)])
+@pytest.mark.parametrize(
+    ("suite", "environments"), [pytest.param("robogauge-1.1", 63, marks=pytest.mark.slow), ("gaitgauge-1", 91)]
+)
 def test_full_run_stays_small(suite, environments):
     result = sample(suite=suite)
     assert len(result.environments) == environments

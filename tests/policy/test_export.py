@@ -128,8 +128,15 @@ def scripted(tmp_path_factory):
     return export
 
 
+QUICK = [("normalized mlp with history", "zeros"), ("blind moe", "zeros"), ("mcp", "zeros"), ("him", "repeat")]
+
+
 @pytest.mark.parametrize(
-    ("kind", "start"), [*((kind, "zeros") for kind in NETWORKS), ("moe", "repeat"), ("him", "repeat")]
+    ("kind", "start"),
+    [
+        pytest.param(*case, marks=() if case in QUICK else pytest.mark.slow)
+        for case in (*((kind, "zeros") for kind in NETWORKS), ("moe", "repeat"), ("him", "repeat"))
+    ],
 )
 def test_torchscript_runs_step_by_step_like_the_policy(kind, start, scripted):
     policy, path = scripted(kind, start)

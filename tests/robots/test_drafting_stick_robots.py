@@ -32,7 +32,12 @@ def failures(robot: Robot) -> dict[str, str]:
 @pytest.mark.parametrize(
     ("shank", "below_end"),
     # by hand: round a stick's end, 1.25 times as wide; half a width back from a flat end, with its corners inside
-    [("capsule", 0.0), ("ellipsoid", -RADIUS), ("cylinder", -RADIUS / 2), ("box", -np.sqrt(2) * RADIUS / 2)],
+    [
+        ("capsule", 0.0),
+        pytest.param("ellipsoid", -RADIUS, marks=pytest.mark.slow),
+        pytest.param("cylinder", -RADIUS / 2, marks=pytest.mark.slow),
+        ("box", -np.sqrt(2) * RADIUS / 2),
+    ],
 )
 def test_a_leg_that_ends_in_a_stick_gets_a_foot_at_its_end(tmp_path, shank, below_end):
     draft, robot = described(write_stick(tmp_path, SHANKS[shank]))

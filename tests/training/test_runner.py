@@ -295,7 +295,7 @@ def test_resume_refuses_what_does_not_fit(tmp_path):
         resume_run(make(), tmp_path / "none.pt")
 
 
-@pytest.mark.parametrize("symmetry", ["none", "augment"])
+@pytest.mark.parametrize("symmetry", [pytest.param("none", marks=pytest.mark.slow), "augment"])
 def test_beginning_with_a_bare_policy(tmp_path, symmetry):
     """First a teacher and a critic for the student, which stands still and acts everywhere; then both go on."""
     settings = toy_configuration(
