@@ -189,7 +189,9 @@ def test_report_is_written_beside_the_results(tmp_path, stress):
 
 
 @pytest.mark.parametrize("key", ["environments", "terrains", "provenance", "policy", "health", "score", "metrics"])
-@pytest.mark.parametrize("value", [None, [1], {"a": 1}, "text", -1, "left out"])
+@pytest.mark.parametrize(
+    "value", [None, {"a": 1}, *(pytest.param(v, marks=pytest.mark.slow) for v in ([1], "text", -1)), "left out"]
+)
 def test_edited_results_are_one_clear_sentence_or_a_page(tmp_path, stress, key, value):
     changed = {**stress.to_data(), key: value}
     if value == "left out":

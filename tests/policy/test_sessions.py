@@ -72,7 +72,9 @@ def expected_actions(network: nn.Module, observations: torch.Tensor) -> list[tor
 
 
 @pytest.mark.parametrize("name", NETWORKS)
-@pytest.mark.parametrize("inference", [True, False], ids=["inference mode", "plain"])
+@pytest.mark.parametrize(
+    "inference", [True, pytest.param(False, marks=pytest.mark.slow)], ids=["inference mode", "plain"]
+)
 def test_a_session_gives_what_its_network_gives(name, inference, tmp_path, contract):
     architecture, arguments = NETWORKS[name]
     network = build(architecture, arguments)

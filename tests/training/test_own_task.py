@@ -117,6 +117,8 @@ OF_THEIRS = [
     *("broken:sys", "broken:fails.x", "raising:f", "leaving:f", "wrong:f", "os:system", "json:loads", "builtins:len"),
     *(".a:f", "a..b:f", "a\0:f", "a:", ":", "x" * 300 + ":f", "\ud800:f", "../a:f", "[/x]:f"),
 ]
+FIRST, DOING = ("rewards", "events"), ("broken:fails", "broken:ends", "broken:long", "leaving:f", "json:loads")
+"""All are tried as rewards and events; where names are read alike for the other settings, the rest is for slow tests."""
 ALLOWED = {
     # what an event returns is not looked at
     "events": ("broken:nothing", "broken:number", "broken:wide", "broken:long"),
@@ -128,7 +130,7 @@ ALLOWED = {
 @pytest.mark.parametrize(
     ("setting", "function"),
     [
-        (setting, function)
+        pytest.param(setting, function, marks=() if setting in FIRST or function in DOING else pytest.mark.slow)
         for setting in ("rewards", "termination", "observations", "events", "generator", "level_rule")
         for function in OF_THEIRS
         if function not in ALLOWED.get(setting, ())
