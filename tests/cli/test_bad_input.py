@@ -148,8 +148,8 @@ def test_wrong_joint_names(refused, tmp_path, contract, stored):
 def test_other_robot_and_other_period(refused, tmp_path, contract, stored):
     save_policy(tmp_path / "other.gauge.pt", replace(contract, robot="spot"), stored)
     assert "'spot'" in refused("evaluate", tmp_path / "other.gauge.pt")
-    save_policy(tmp_path / "slow.gauge.pt", replace(contract, control_period=0.04), stored)
-    assert "0.04" in refused("evaluate", tmp_path / "slow.gauge.pt")
+    save_policy(tmp_path / "slow.gauge.pt", replace(contract, control_period=0.015), stored)
+    assert "0.015" in refused("evaluate", tmp_path / "slow.gauge.pt")
 
 
 # ---- requests -------------------------------------------------------------------------------------------------------
