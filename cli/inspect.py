@@ -262,6 +262,30 @@ def _policy_row(path: Path) -> tuple[str, str, str, str]:
     return str(shown), contract.robot, contract.hash[:_HASH], saved
 
 
+def _presets() -> Table:
+    from ..policy.foreign.presets import presets
+
+    table = make_table(
+        "presets (--contract NAME, or preset = NAME in a contract.toml)", "name", "whose", "joints", "observation"
+    )
+    for each in presets().values():
+        order = f"{'leg by leg' if each.order == 'legs' else 'kind by kind'}, {' '.join(each.legs)}"
+        terms = ", ".join(f"{t.name} × {_numbers(t.scale)}" for t in each.observation)
+        table.add_row(each.name, each.title, order, terms)
+    return table
+
+
+def _zoo() -> Table:
+    from ..policy.foreign.zoo import zoo
+
+    columns = ("what it is", "file", "robot", "observation", "from", "licence", "left open by its authors")
+    table = make_table("public policies that are known by their content (gaitgauge evaluate FILE)", *columns)
+    for each in zoo().values():
+        words = (each.robot, each.observed(), each.source, each.licence, each.note or "")
+        table.add_row(each.title, each.file, *words)
+    return table
+
+
 LISTS: dict[str, Callable[[], Table]] = {
     "robots": _robots,
     "terrains": _terrains,
@@ -269,6 +293,8 @@ LISTS: dict[str, Callable[[], Table]] = {
     "suites": _suites,
     "scenarios": _scenarios,
     "policies": _policies,
+    "presets": _presets,
+    "zoo": _zoo,
     "tasks": _tasks,
 }
 """Tables of ``gaitgauge list``, by kind."""

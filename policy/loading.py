@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,8 +18,9 @@ from .finding import find_policy
 from .foreign.adapters import LONGEST_HISTORY, contract_for_width, described
 from .foreign.bodies import DEFAULT_ROBOT
 from .foreign.fence.archive import archive_names, read_limited
-from .foreign.readers import Facts, find_description, read_description
+from .foreign.readers import Facts, contract_beside, find_description, read_description
 from .foreign.rsl_rl import checkpoint_network
+from .foreign.zoo import known_contract, zoo
 from .native import FilePolicy, ForeignFile, NativePolicy, StoredNetwork, is_policy, load_entries, read_policy
 
 if TYPE_CHECKING:
@@ -37,7 +38,8 @@ def load_policy(
 
     A file's content decides what it is, not its ending: the project's own format, TorchScript, ONNX, or a bare rsl_rl
     checkpoint. Of a TorchScript or ONNX file only operators that compute are run, in a process that can do nothing else
-    (``docs/reference/security.md``).
+    (``docs/reference/security.md``). A public file that the zoo knows is run as the zoo says, unless a contract is given or
+    lies beside it.
 
     Args:
         path_or_name: a file, or a name (see ``find_policy``).
@@ -45,7 +47,7 @@ def load_policy(
             accepted, and the Go2 stands in.
         trust: run a program that a file of the project's own format carries inside; it is fenced in either way.
         contract_file: a description of how a file without a contract of its own is to be run, of this project or of one
-            that is understood (``foreign.readers``); it goes before all else.
+            that is understood (``foreign.readers``), or the name of a preset (``foreign.presets``); it goes before all else.
 
     Raises:
         PolicyError: no such file or name, a damaged or foreign file, or a network that does not fit its contract.
@@ -54,8 +56,11 @@ def load_policy(
     path = find_policy(path_or_name)
     data = read_limited(path)
     given = None if contract_file is None else Path(contract_file)
-    policy = _load(data, path, str(path_or_name), robot, trust=trust, given=given)
-    policy.file_sha256 = hashlib.sha256(data).hexdigest()
+    sha256 = hashlib.sha256(data).hexdigest()
+    known = zoo().get(sha256) if given is None and contract_beside(path) is None else None
+    described_by = given if known is None else known_contract(known, robot)
+    policy = _load(data, path, str(path_or_name), robot, trust=trust, given=described_by)
+    policy.file_sha256 = sha256
     if sentence := described(policy.contract):
         _say(policy.path, sentence)
     if robot is not None:
@@ -96,8 +101,10 @@ def _say(path: str, sentence: str) -> None:
     logging.getLogger(__name__).warning("'%s' %s", path, sentence)
 
 
-def _load(data: bytes, path: Path, source: str, robot: Robot | None, *, trust: bool, given: Path | None) -> FilePolicy:
-    """Load a file's content; ``path`` is where its sidecars are, ``source`` what the user called it."""
+def _load(
+    data: bytes, path: Path, source: str, robot: Robot | None, *, trust: bool, given: Path | PolicyContract | None
+) -> FilePolicy:
+    """Load a file's content; ``path`` is where its sidecars are, ``source`` what the user called it, ``given`` its description."""
     kind = file_kind(data, source)
     if kind in ("torchscript", "onnx"):
         return _foreign(ForeignFile(kind=kind, data=data), path, source, robot, contract=given)
@@ -114,7 +121,10 @@ def _load(data: bytes, path: Path, source: str, robot: Robot | None, *, trust: b
                 "add --trust (in Python trust=True) to run it, in a process of its own"
             )
         return _foreign(network, path, source, robot, contract=inside)
-    read = find_description(path, robot, Facts()) if given is None else read_description(given, robot, Facts())
+    if isinstance(given, PolicyContract):
+        read: PolicyContract | None = given
+    else:
+        read = find_description(path, robot, Facts()) if given is None else read_description(given, robot, Facts())
     found = checkpoint_network(entries, robot or load_robot(DEFAULT_ROBOT), path=path, contract=read)
     if found is None:
         raise PolicyError(f"'{source}' is a torch.save file, but neither a gaitgauge policy nor an rsl_rl checkpoint")
@@ -135,7 +145,8 @@ def _foreign(
 
     file, program, metadata = _start(file, source, path.parent)
     if isinstance(contract, Path):
-        facts = Facts(inputs=program.child.ask("inputs")["names"], metadata=metadata)
+        inputs = program.child.ask("inputs")["names"]
+        facts = Facts(inputs=inputs, metadata=metadata, width=partial(_width, program))
         contract = read_description(contract, robot, facts)
     contract = contract or _foreign_contract(program, file.kind, metadata, path, source, robot)
     encoder = None
@@ -178,6 +189,12 @@ def _start(file: ForeignFile, source: str, folder: Path) -> tuple[ForeignFile, S
     return file, Started(child=Child(GraphProgram, file.data, source=source), attributes=()), metadata
 
 
+def _width(program: Started, candidates: Sequence[int]) -> int | None:
+    """Return the width of a program's input, which tries likely ones."""
+    width = program.child.ask("width", candidates=list(candidates))["width"]
+    return None if width is None else int(width)
+
+
 def _foreign_contract(
     program: Started, kind: str, metadata: Mapping[str, str], path: Path, source: str, robot: Robot | None
 ) -> PolicyContract:
@@ -188,9 +205,9 @@ def _foreign_contract(
     robot = robot or load_robot(DEFAULT_ROBOT)
     frame = standard_contract(robot).frame_width
     order: HistoryOrder = "term-major" if kind == "onnx" else "frame-major"
-    width = program.child.ask("width", candidates=[frame * n for n in range(1, LONGEST_HISTORY + 1)])["width"]
+    width = _width(program, [frame * n for n in range(1, LONGEST_HISTORY + 1)])
     provenance = {"adapter": "ONNX" if kind == "onnx" else "TorchScript", "file": path.name}
-    return contract_for_width(int(width or frame), robot, order=order, provenance=provenance, source=source)
+    return contract_for_width(width or frame, robot, order=order, provenance=provenance, source=source)
 
 
 def file_kind(data: bytes, source: str) -> str:

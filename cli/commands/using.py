@@ -15,7 +15,7 @@ app = typer.Typer()
 robot = typer.Typer(no_args_is_help=True, help="Describe a robot of your own, and check it.")
 contract = typer.Typer(no_args_is_help=True, help="Describe how a policy is to be run, and see how it is.")
 
-LISTS = ("robots", "terrains", "backends", "suites", "scenarios", "policies", "tasks")
+LISTS = ("robots", "terrains", "backends", "suites", "scenarios", "policies", "presets", "zoo", "tasks")
 """Kinds of names that can be listed."""
 _ARCHITECTURES = "GPU architecture, such as sm_90 (H100, H200); repeatable. Default: this machine's GPU."
 _ENGINES = Choice("mujoco-warp or newton; repeatable. Default: mujoco-warp.", values=("mujoco-warp", "newton"))
@@ -136,7 +136,9 @@ def show(request: ShowRequest) -> None:
 
 @command(app, "list")
 def list_command(
-    what: Annotated[str, Choice("robots, terrains, backends, suites, scenarios, policies or tasks.", None, LISTS)],
+    what: Annotated[
+        str, Choice("robots, terrains, backends, suites, scenarios, policies, presets, zoo or tasks.", None, LISTS)
+    ],
 ) -> None:
     """List what can be named on the command line.
 

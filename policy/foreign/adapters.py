@@ -76,6 +76,9 @@ def described(contract: PolicyContract) -> str | None:
     if adapter is None or (adapter == "contract.toml" and assumed is None):
         return None
     file = contract.provenance.get("file")
+    if adapter == "zoo" or adapter.startswith("preset "):
+        where = f"the zoo's {file}" if adapter == "zoo" else f"the {adapter}"
+        return f"is run as {where} says" + (f"; {assumed}" if assumed else "")
     source = f"'{file}'" if adapter in (None, file) or "metadata" in adapter else f"'{file}' ({adapter})"
     return f"is run as {'its metadata say' if 'metadata' in adapter else source + ' says'}" + (
         f"; {assumed}" if assumed else ""

@@ -4,20 +4,22 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from ...files.parsing import parse_toml, read_text
+from ...files.parsing import parse_toml, read_text, shown
 from ...robots.base import Robot
 from ..base import PolicyError
 from ..contract import PER_ENTRY, PER_JOINT, ContractError, PolicyContract, reordered, standard_contract
 from .bodies import choose_robot
+from .presets import find_preset, preset_contract, presets
 
 
 def described_contract(path: Path, asked: Robot | None) -> PolicyContract:
     """Read a ``contract.toml``: fields of ``PolicyContract``; fields left out are the robot's standard ones. Where
     it lists the joints in an order of its own, standard values per joint go with their joints. One number stands for all
-    joints, or for all entries of an observation.
+    joints, or for all entries of an observation. With ``preset`` the fields left out are that preset's.
 
     Raises:
         PolicyError: no such file, or a field is unknown or malformed.
@@ -26,13 +28,30 @@ def described_contract(path: Path, asked: Robot | None) -> PolicyContract:
     data = parse_toml(read_text(path, "contract file", PolicyError), source, PolicyError)
     named = data.get("robot")
     robot = choose_robot(asked, named if asked is None and isinstance(named, str) else None, path)
-    provenance = {"adapter": "contract.toml", "file": path.name}
-    standard = standard_contract(robot, provenance=provenance)
-    names = data.get("joint_names")
-    if isinstance(names, list) and len(names) == robot.num_joints and all(n in names for n in robot.joint_names):
-        standard = reordered(standard, names)
-    joints = len(names) if isinstance(names, list) else robot.num_joints
-    assumed: list[str] = []
+    return contract_of(data, robot, source, {"adapter": "contract.toml", "file": path.name})
+
+
+def contract_of(
+    data: dict[str, Any], robot: Robot | None, source: str, provenance: Mapping[str, Any]
+) -> PolicyContract:
+    """Return the contract that a table of a ``contract.toml`` describes.
+
+    Args:
+        data: the table; it is changed.
+        robot: the robot, under whatever name it is asked for; None where it is not installed and the table says everything.
+        source: origin of the table, the beginning of every sentence.
+        provenance: of the contract.
+
+    Raises:
+        PolicyError: a field is unknown, missing or malformed.
+    """
+    names, preset = data.get("joint_names"), data.pop("preset", None)
+    usual: dict[str, Any] = {"control_period": 0.02, "history": {}, "provenance": provenance}
+    if robot is not None:
+        usual = _usual(data, robot, preset, source) | {"provenance": provenance}
+        data["robot"] = robot.name
+    joints = len(names) if isinstance(names, list) else len(usual.get("joint_names", ()))
+    assumed = [str(provenance["assumed"])] if "assumed" in provenance else []
     for name in PER_JOINT:
         if _is_number(data.get(name)):
             data[name] = [data[name]] * joints
@@ -51,9 +70,29 @@ def described_contract(path: Path, asked: Robot | None) -> PolicyContract:
     if assumed:
         data["provenance"] = {**provenance, "assumed": ", ".join(assumed)}
     try:
-        return PolicyContract.from_dict({**standard.to_dict(), **data})
+        return PolicyContract.from_dict({**usual, **data})
     except ContractError as error:
         raise PolicyError(f"{source} is wrong: {error}") from error
+
+
+def _usual(data: dict[str, Any], robot: Robot, preset: object, source: str) -> dict[str, Any]:
+    """Return the values of fields that are left out: the robot's standard ones, or those of a preset, whose history is continued."""
+    names, history = data.get("joint_names"), data.get("history")
+    if preset is None:
+        standard = standard_contract(robot)
+    elif isinstance(preset, str):
+        length = history.get("length", 1) if isinstance(history, dict) else 1
+        try:
+            standard = preset_contract(find_preset(preset), robot, frames=length if type(length) is int else 1)
+        except PolicyError as error:
+            raise PolicyError(f"{source}: {error}") from error
+        if isinstance(history, dict):
+            data["history"] = {**asdict(standard.history), **history}
+    else:
+        raise PolicyError(f"{source}: preset is {shown(preset)}; it must be one of {', '.join(presets())}")
+    if isinstance(names, list) and len(names) == robot.num_joints and all(n in names for n in robot.joint_names):
+        standard = reordered(standard, names)
+    return standard.to_dict()
 
 
 def _is_number(value: object) -> bool:

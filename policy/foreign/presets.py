@@ -129,7 +129,10 @@ def preset_contract(preset: Preset, robot: Robot | Quadruped, *, frames: int = 1
     """
     body = robot if isinstance(robot, Quadruped) else Quadruped(robot)
     names, own = body.joint_order(preset.order, preset.legs), preset.robots.get(body.robot.name)
-    provenance = {"adapter": f"preset {preset.name}", "assumed": f"preset {preset.name}"}
+    rest = "command limits and control period"
+    if own is None:
+        rest = f"pose, gains, {rest}"
+    provenance = {"adapter": f"preset {preset.name}", "assumed": f"{rest} of robot '{body.robot.name}'"}
     values = reordered(standard_contract(body.robot, provenance=provenance), names).to_dict()
     values |= {} if own is None else asdict(own)
     values |= {"action_scale": preset.action_scale, "action_clip": preset.action_clip}

@@ -12,12 +12,15 @@ from ...files.parsing import parse_yaml, read_text
 from ...robots.base import Robot
 from ..base import PolicyError
 from ..contract import ContractError, PolicyContract, reordered
+from .adapters import LONGEST_HISTORY
+from .bodies import choose_robot
 from .deploy_yaml import is_deploy, read_deploy
 from .described import described_contract
 from .holosoma import holosoma_contract
 from .isaac_lab import is_env, read_env
 from .legged_gym import is_legged_gym, read_legged_gym
 from .mjlab import mjlab_contract
+from .presets import find_preset, fitting_presets, preset_contract
 from .rl_sar import is_rl_sar, read_rl_sar
 
 _MOST_BESIDE = 40
@@ -33,6 +36,8 @@ class Facts:
     inputs: Sequence[str] = ()
     """Names of the inputs that take observations, where they have names."""
     metadata: Mapping[str, str] = field(default_factory=dict)
+    width: Callable[[Sequence[int]], int | None] | None = None
+    """Return the width of its input; it is asked with widths that are likely."""
 
 
 Reader = Callable[[Mapping[str, Any], Path, Robot | None], PolicyContract]
@@ -50,11 +55,13 @@ def _reader(data: Mapping[str, Any], facts: Facts) -> Reader | None:
 
 
 def read_description(path: Path, asked: Robot | None, facts: Facts) -> PolicyContract:
-    """Return the contract in a file that the user names: of this project, or of one whose descriptions are known.
+    """Return the contract in a file that the user names: of this project, or of one whose descriptions are known; or of a preset.
 
     Raises:
         PolicyError: no such file, none of the known kinds, malformed, or for another robot.
     """
+    if not path.suffix and len(path.parts) == 1 and not path.exists():
+        return _named_preset(str(path), asked, facts)
     if path.suffix == ".toml":
         return described_contract(path, asked)
     text = read_text(path, "contract file", PolicyError)
@@ -73,6 +80,32 @@ def read_description(path: Path, asked: Robot | None, facts: Facts) -> PolicyCon
     return read(data, path, asked)
 
 
+def _named_preset(name: str, asked: Robot | None, facts: Facts) -> PolicyContract:
+    """Return the contract of a preset, with as many frames as the policy's input holds."""
+    try:
+        preset = find_preset(name)
+    except PolicyError as error:
+        raise PolicyError(f"--contract '{name}' is no file, and {error}") from error
+    robot = choose_robot(asked, None, name)
+    one = preset_contract(preset, robot)
+    if facts.width is None:
+        return one
+    frame = one.frame_width
+    width = facts.width([frame * n for n in range(1, LONGEST_HISTORY + 1)]) or frame
+    if width % frame:
+        fitting = ", ".join(fitting_presets(robot, width)) or "none"
+        raise PolicyError(
+            f"preset '{name}' gives {frame} values a frame, but the policy takes {width}; presets that fit: {fitting}"
+        )
+    return preset_contract(preset, robot, frames=width // frame)
+
+
+def contract_beside(path: Path) -> Path | None:
+    """Return the contract of this project's kind that lies beside a policy, None where there is none."""
+    names = (f"{path.stem}.contract.toml", "contract.toml", f"{path.stem}.contract.json", "contract.json")
+    return next((path.with_name(name) for name in names if path.with_name(name).is_file()), None)
+
+
 def find_description(path: Path, asked: Robot | None, facts: Facts) -> PolicyContract | None:
     """Return the contract that lies beside a policy or in it, None where there is none.
 
@@ -82,9 +115,8 @@ def find_description(path: Path, asked: Robot | None, facts: Facts) -> PolicyCon
     Raises:
         PolicyError: a description is malformed or for another robot, or two of them disagree.
     """
-    for name in (f"{path.stem}.contract.toml", "contract.toml", f"{path.stem}.contract.json", "contract.json"):
-        if path.with_name(name).is_file():
-            return read_description(path.with_name(name), asked, facts)
+    if (own := contract_beside(path)) is not None:
+        return read_description(own, asked, facts)
     if "contract" in facts.metadata:
         try:
             return PolicyContract.from_json(facts.metadata["contract"])

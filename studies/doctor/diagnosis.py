@@ -26,6 +26,8 @@ SOUND = 0.7
 """Score from which a robot walks; one that stands still has about 0.6."""
 CLEAR = 0.05
 """How much better another contract must be before anything is said [score]."""
+_DOUBT = 0.08
+"""The same where the robot walks as described: other gains or a larger action scale alone are worth up to 0.07."""
 _GOOD = 0.82
 """Score from which nothing further is looked for; trained policies that are described rightly have 0.78 to 0.91."""
 _NEEDED = 0.02
@@ -136,7 +138,7 @@ def diagnose(
             best, nearby = _search(bench, robot, described, others, seconds, report)
             others += nearby
         mistakes: tuple[Outcome, ...] = ()
-        if best.score > described.score + CLEAR:
+        if best.score > described.score + (_DOUBT if described.score >= SOUND else CLEAR):
             mistakes = _explained(bench, robot, given, best, seconds)
     name = best.contract.provenance.get(_PRESET)
     return Diagnosis(

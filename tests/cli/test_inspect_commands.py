@@ -3,6 +3,7 @@ from gaitgauge.backends.registry import backend_names
 from gaitgauge.cli import doctor
 from gaitgauge.gauge.pipelines import make_environments
 from gaitgauge.gauge.suite import load_suite, suite_names
+from gaitgauge.policy.foreign.presets import presets
 from gaitgauge.policy.loading import load_policy
 from gaitgauge.terrains.registry import terrain_names
 from gaitgauge.training.tasks import TASKS
@@ -15,6 +16,8 @@ def test_lists_are_complete(run):
         "suites": suite_names(),
         "tasks": list(TASKS),
         "policies": ["latest", "best", "pretrained"],
+        "presets": list(presets()),
+        "zoo": ["himloco.pt", "270, frames", "PMY9527"],
     }.items():
         result = run("list", what)
         assert result.exit_code == 0
