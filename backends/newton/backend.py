@@ -17,7 +17,7 @@ import torch
 import warp as wp
 
 from ..arguments import check_force
-from ..base import BackendError, Capability, PhysicsOptions, Randomization, Scene
+from ..base import BackendError, Capability, PhysicsOptions, Randomization, Scene, Support
 from ..dry_friction import dry_friction_slope
 from ..warp.backend import WarpBackend
 from ..warp.device import is_memory_error, memory_advice
@@ -223,13 +223,16 @@ class NewtonBackend(WarpBackend):
 
     def randomize(self, randomization: Randomization, worlds: torch.Tensor | None = None) -> None:
         """See ``PhysicsBackend.randomize``. Fields may also have a row for every world; then the masked rows count."""
-        if randomization.foot_torsion is not None or randomization.foot_softness is not None:
+        feet = randomization.foot_torsion is not None or randomization.foot_softness is not None
+        if feet and self.capabilities()["foot_contact"].support is Support.NONE:
             own = f"backend '{self.name}' has the same feet in all worlds"
-            raise BackendError(f"{own}; leave foot_torsion and foot_softness out, or use 'mujoco-warp'")
+            raise BackendError(f"{own}; leave foot_torsion and foot_softness out, or use 'newton' or 'mujoco-warp'")
         masses, rows = self._masses, self._changes(randomization, worlds)
         self._write_motors(rows)
         if "friction" in rows:
             self._write(masses.friction, rows["friction"][:, None])
+        for target, values in masses.feet(rows):
+            self._write(target, values)
         for name, target in (
             ("base_mass_offset", masses.base_offset),
             ("link_mass_scale", masses.link_scale),
@@ -238,7 +241,7 @@ class NewtonBackend(WarpBackend):
             if name in rows:
                 self._write(target, rows[name])
         with self._scope():
-            if "friction" in rows:
+            if "friction" in rows or feet:
                 self._solver.shapes_changed(self._terrain_array)
             if "base_com_offset" in rows:
                 shift = (self._layout, masses.nominal_com, wp.from_torch(masses.com_offset))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import newton
@@ -40,6 +41,12 @@ class MassTensors:
         self._scale = torch.ones((worlds, layout.bodies), dtype=torch.float32, device=device)
         self.friction = wp.to_torch(model.shape_material_mu).view(worlds, layout.shapes)
         """Sliding friction of every shape, (N, S)."""
+        names = ("mu_torsional", "mu_rolling", "ke", "kd")
+        contact = {name: wp.to_torch(getattr(model, f"shape_material_{name}")) for name in names}
+        self.contact = {name: values.view(worlds, layout.shapes) for name, values in contact.items()}
+        """Torsional and rolling friction, stiffness and damping of every shape's contacts, (N, S) each."""
+        self._nominal_contact = {name: values[0].clone() for name, values in self.contact.items()}
+        self._foot = torch.as_tensor(layout.shape_foot, device=device)[: layout.shapes] >= 0
         self.base_offset = torch.zeros(worlds, dtype=torch.float32, device=device)
         """Mass added to the base [kg], (N,)."""
         self.link_scale = torch.ones((worlds, len(self._order)), dtype=torch.float32, device=device)
@@ -47,6 +54,17 @@ class MassTensors:
         self.com_offset = torch.zeros((worlds, 3), dtype=torch.float32, device=device)
         """Shift of the base's centre of mass [m], (N, 3)."""
         self.nominal_com = wp.vec3(*world.reference.body_ipos[layout.base + 1])
+
+    def feet(self, rows: Mapping[str, torch.Tensor]) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
+        """Yield contact parameters of every shape, and the values that randomized feet of each world have, (N, S) both.
+
+        A time constant of s times MuJoCo's has 1 / s² of the stiffness and 1 / s of the damping.
+        """
+        powers = {"foot_torsion": {"mu_torsional": 1, "mu_rolling": 1}, "foot_softness": {"ke": -2, "kd": -1}}
+        for field in powers.keys() & rows.keys():
+            for name, power in powers[field].items():
+                nominal = self._nominal_contact[name]
+                yield self.contact[name], nominal * torch.where(self._foot, rows[field][:, None] ** power, 1.0)
 
     def write(self, adapter: SolverAdapter) -> None:
         """Write masses and inertias into the model and tell the solver."""

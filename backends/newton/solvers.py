@@ -123,7 +123,6 @@ class MujocoAdapter(SolverAdapter):
 
     name = "mujoco"
     capabilities = _declare(
-        foot_contact=_SAME_FEET,
         deterministic=_roughly(
             "to the last bit on a CPU; on a GPU by mujoco_warp's mode, but for sums of contact forces"
         ),

@@ -21,6 +21,8 @@ Array = NDArray[np.float64]
 Outcomes = Sequence[bool | None]
 """Outcome of each search seed at a level, in the order of the seeds; None for those that have not ended."""
 
+_REACH = 5
+"""Levels from the crossing at which a single trial is left."""
 _SHRUNK = 0.5
 """Share of an environment's variance that is taken from the mean of all environments: six trials alone show it badly."""
 _USUAL = 0.1
@@ -69,7 +71,7 @@ def follow_area(outcomes: Callable[[int], Outcomes], levels: int, seeds: int) ->
 
 @lru_cache(maxsize=4096)
 def trial_counts(first: tuple[bool, ...], seeds: int) -> tuple[int, ...]:
-    """Return the number of trials at each level: ``seeds`` beside the crossing, a half, a third … of them one, two … levels away.
+    """Return the number of trials at each level: ``seeds`` beside the crossing, a fifth of them less with every level away, one at least.
 
     The crossing is the split of the other levels into passed ones below and failed ones above that contradicts the fewest of their
     first outcomes; splits that do as well count alike. The own outcome of a level plays no part in its number.
@@ -82,7 +84,7 @@ def trial_counts(first: tuple[bool, ...], seeds: int) -> tuple[int, ...]:
         against = failed_below + passed_above
         best = np.flatnonzero(against == against.min())
         away = max(int(best[0]) - at, at - int(best[-1]), 0)
-        counts.append(max(seeds // (1 + away), 1))
+        counts.append(max(seeds * (_REACH - away) // _REACH, 1))
     return tuple(counts)
 
 

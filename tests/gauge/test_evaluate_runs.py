@@ -72,8 +72,8 @@ def test_a_whole_run(request_for, tmp_path, base):
     of_flat = [r for r in rows if r["stage"] == "eval" and r["terrain"] == "flat"]
     quality = np.mean([float(r["quality_mean50"]) for r in of_flat])
     assert quality == pytest.approx(flat.score, abs=2e-4)
-    # an area takes all search seeds beside the crossing and one at level 1, a test as many as decide it
-    trials, far = (3, 1) if base == "gaitgauge-1" else (2, 0)
+    # an area takes all search seeds beside the crossing and two at level 1, a test as many as decide it
+    trials, far = (3, 2) if base == "gaitgauge-1" else (2, 0)
     assert len(rows) == len(files) == 4 + 2 * trials + far
     assert [r["success"] for r in rows if r["stage"] == "search" and r["level"] == "3"] == ["False"] * trials
     if base == "gaitgauge-1":

@@ -29,15 +29,15 @@ def found(table):
 @pytest.mark.parametrize(
     ("outcomes", "counts"),
     [
-        (first(5), (1, 1, 2, 3, 6, 6, 3, 2, 1, 1)),
-        (first(10), (1, 1, 1, 1, 1, 1, 1, 2, 3, 6)),
-        (first(0), (6, 3, 2, 1, 1, 1, 1, 1, 1, 1)),
+        (first(5), (1, 2, 3, 4, 6, 6, 4, 3, 2, 1)),
+        (first(10), (1, 1, 1, 1, 1, 1, 2, 3, 4, 6)),
+        (first(0), (6, 4, 3, 2, 1, 1, 1, 1, 1, 1)),
         # one level that fails between others that pass: it is not the crossing of the others
-        ((True, True, False, *[True] * 3, *[False] * 4), (1, 1, 1, 2, 3, 6, 6, 3, 2, 1)),
+        ((True, True, False, *[True] * 3, *[False] * 4), (1, 1, 2, 3, 4, 6, 6, 4, 3, 2)),
     ],
 )
 def test_most_trials_are_beside_the_crossing(outcomes, counts):
-    """Six beside it, then a half, a third; counted by hand."""
+    """Six beside it, then four, three, two and one; counted by hand."""
     assert trial_counts(outcomes, 6) == counts
 
 
@@ -124,5 +124,5 @@ def test_what_is_required_once_stays_counted_and_was_possible_before():
 
 def test_a_robot_that_stands_plays_few_trials_and_no_quality():
     records, _ = play(WAVE, RULES, lambda _: False)
-    assert len(records) == 7 + 3 + 2 + 7
+    assert len(records) == 6 + 4 + 3 + 2 + 6
     assert environment_result(WAVE, records, RULES).level == 0.0

@@ -138,8 +138,8 @@ def test_a_suite_may_limit_torque_by_speed(suite_file):
             "scoring.level is 'area', and episodes need noise of their own",
         ),
         (
-            "[scoring]\nlevel = 'curve'\nbracket_seeds = 8",
-            "scoring.bracket_seeds is 8; at most the 7 of matrix.search_seeds",
+            "[scoring]\nlevel = 'curve'\nbracket_seeds = 7",
+            "scoring.bracket_seeds is 7; at most the 6 of matrix.search_seeds",
         ),
         ("[push]\nforce = [100.0, 80.0]", "push.force .100 to 80 N. must rise"),
         ("[push]\nafter = [3.5, 1.5]", "push.after .3.5 to 1.5 s. must rise"),
