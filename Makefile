@@ -69,7 +69,7 @@ check: install
 docs: docs-pages docs-site
 
 docs-pages: install
-	$(BIN)/python -m pytest -n auto --dist worksteal -m 'slow or not slow' tests/docs
+	$(BIN)/python -m pytest -n auto --dist worksteal -m 'not nightly' tests/docs
 
 docs-site: install
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet

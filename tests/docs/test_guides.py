@@ -155,8 +155,26 @@ def test_links_lead_to_files(page):
     assert [os.path.relpath(path, ROOT) for path in paths if not path.exists() and path not in GENERATED] == []
 
 
+NIGHTLY = {
+    "docs/guides/board.md": "tests/cli/test_verify_command.py",
+    "docs/guides/consistency.md": "tests/cli/test_consistency_command.py",
+}
+"""Pages whose commands take a minute, and the fast tests that run these commands on smaller suites."""
+RUN = [
+    pytest.param(page, marks=pytest.mark.nightly if title(page) in NIGHTLY else ())
+    for page in PAGES
+    if any(block.mark for block in blocks(page))
+]
+
+
+def test_what_is_run_at_night_alone_has_a_fast_test():
+    for page, test in NIGHTLY.items():
+        names = {words[0] for words in commands(ROOT / page)}
+        assert any(f'"{name}"' in (ROOT / test).read_text() for name in names), page
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("page", [p for p in PAGES if any(b.mark for b in blocks(p))], ids=title)
+@pytest.mark.parametrize("page", RUN, ids=title)
 def test_marked_blocks_run(page, tmp_path):
     site = tmp_path / "site"
     site.mkdir()
