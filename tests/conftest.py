@@ -26,10 +26,14 @@ _FAKE_ENGINE = str(Path(__file__).parent / "fake_engine")
 os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (_FAKE_ENGINE, os.environ.get("PYTHONPATH"))))
 
 
+gc.disable()  # until all is imported: most of it stays
+
+
 def pytest_collection_finish() -> None:
     """Leave what the packages made when they were imported out of every later search for garbage."""
     gc.collect()
     gc.freeze()
+    gc.enable()
     gc.set_threshold(50_000, 20, 20)  # tests leave little behind, and the searches took a fiftieth of the time
 
 

@@ -102,7 +102,7 @@ def test_it_finds_what_mujoco_warp_finds(spheres, cone, condim, device, monkeypa
     assert found["row force"].shape[1] > (3 + 44 if spheres == MANY and condim > 1 else 0)
 
 
-@pytest.mark.parametrize("spheres", [FEW, MANY])
+@pytest.mark.parametrize("spheres", [FEW, pytest.param(MANY, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(("cone", "condim"), CONES)
 def test_it_is_as_near_to_double_precision_as_mujoco_warp(spheres, cone, condim, monkeypatch):
     model = model_of(spheres, options=f'tolerance="0" {cone}', condim=condim)

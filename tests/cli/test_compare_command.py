@@ -85,6 +85,7 @@ def test_what_was_not_made_alike_is_refused_before_anything_is_played(run, refus
     assert not (tmp_path / "results").exists()
 
 
+@pytest.mark.slow
 def test_policies_whose_files_are_called_alike_are_told_apart_before_anything_is_played(run, tmp_path, policy, tiny):
     for method in ("HIM", "CTS"):
         (tmp_path / method / "seed-1" / "kept").mkdir(parents=True)

@@ -2,6 +2,7 @@
 
 import json
 
+import pytest
 from gaitgauge.cli.console import Terminal
 from gaitgauge.cli.latent import print_latents
 
@@ -17,6 +18,7 @@ def test_tables_and_a_sentence_on_what_was_left_out(run, policy, tmp_path):
     assert found["policies"][0]["label"] == "pretrained" and found["terrains"] == ["flat", "wave"]
 
 
+@pytest.mark.slow
 def test_a_single_terrain_is_said_to_have_nothing_to_be_told_from(run):
     result = run("latent", "pretrained", *SHORT[2:], "--out", "here")
     assert result.exit_code == 1 and "commands told apart" in result.stdout

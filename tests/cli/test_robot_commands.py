@@ -43,6 +43,7 @@ def test_new_and_check(run, model):
     assert rows["SDK order"]["needed_for"] == "export of a deploy.yaml"
 
 
+@pytest.mark.slow
 def test_a_bare_process_has_loaded_what_its_enclosed_one_calls(tmp_path):
     """The enclosed one cannot read the package's own files, and a test's process has loaded more than a user's."""
     program = [sys.executable, "-m", "gaitgauge.cli.main", "robot"]

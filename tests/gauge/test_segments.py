@@ -249,7 +249,7 @@ WHOLE = [[5] * 7 + [4], [5] * 5 + [4]]  # the goal's clock ends the last sub-com
 STEPS, SUBSTEPS = 12, 25
 
 
-@pytest.mark.parametrize("worlds", [3, 24])
+@pytest.mark.parametrize("worlds", [3, pytest.param(24, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     ("falls", "penetrations", "samples", "fell", "restarted", "steps", "substeps"),
     [

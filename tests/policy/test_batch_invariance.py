@@ -59,7 +59,9 @@ def test_rows_of_the_other_methods_networks_do_not_matter(architecture):
     assert not isinstance(session, RowwiseSession)
 
 
-@pytest.fixture(scope="module", params=["own", "torchscript", "onnx", "row by row"])
+@pytest.fixture(
+    scope="module", params=["own", "torchscript", "onnx", pytest.param("row by row", marks=pytest.mark.slow)]
+)
 def policy(request, tmp_path_factory):
     """The shipped policy and its exports, and a network that needs each row alone."""
     own = load_policy("pretrained", ROBOT)

@@ -207,7 +207,9 @@ def test_batch_equals_single_modules(loaded, observations, name, run):
                     np.testing.assert_allclose(actions[step, row], expected[0], atol=1e-5)
 
 
-@pytest.mark.parametrize(("name", "warned"), [("history", False), ("fixed", True), ("counting", True)])
+@pytest.mark.parametrize(
+    ("name", "warned"), [("history", False), ("fixed", True), pytest.param("counting", True, marks=pytest.mark.slow)]
+)
 def test_a_warning_comes_once_where_a_file_plays_row_by_row(tmp_path, cts_network, caplog, name, warned):
     path = save(modules(cts_network)[name], tmp_path / "policy.pt")
     policy = load_policy(path)
@@ -289,7 +291,13 @@ class InList(WithHistory):
 
 @pytest.mark.parametrize(
     "variant",
-    [BesideNone, BesideWeightsAndLatent, BesideSqueezedWeights, BesideThree, InList],
+    [
+        BesideNone,
+        BesideWeightsAndLatent,
+        pytest.param(BesideSqueezedWeights, marks=pytest.mark.slow),
+        pytest.param(BesideThree, marks=pytest.mark.slow),
+        InList,
+    ],
     ids=lambda v: v.__name__,
 )
 def test_actions_are_first_in_every_kind_of_output(tmp_path, cts_network, cts_file, observations, variant, run):
@@ -358,7 +366,7 @@ def test_wrong_batch_is_refused(loaded):
             session.act(torch.zeros(2, 45))
 
 
-@pytest.mark.parametrize("name", ["history", "counting"])
+@pytest.mark.parametrize("name", ["history", pytest.param("counting", marks=pytest.mark.slow)])
 def test_import_keeps_actions_and_needs_no_sidecar(tmp_path, contract, cts_network, observations, name, run):
     (tmp_path / "source").mkdir()
     path = save(modules(cts_network)[name], tmp_path / "source" / "policy.pt")

@@ -90,7 +90,11 @@ def test_progress_may_be_counted_along_whichever_way_the_robot_heads(along, hold
 
 
 @pytest.mark.parametrize(
-    ("rewards", "stuck"), [(RewardConfiguration(progress_along="command"), True), (RewardConfiguration(), False)]
+    ("rewards", "stuck"),
+    [
+        (RewardConfiguration(progress_along="command"), True),
+        pytest.param(RewardConfiguration(), False, marks=pytest.mark.slow),
+    ],
 )
 def test_who_walks_an_arc_without_turning_fast_enough_is_not_stuck(rewards, stuck):
     environment = make(

@@ -80,7 +80,11 @@ def test_a_sweep_that_is_not_there(tmp_path):
 SHIPPED = sorted((ROOT / "benchmarks" / "sweeps").glob("*.toml"))
 
 
-@pytest.mark.parametrize("path", SHIPPED, ids=lambda p: p.stem)
+@pytest.mark.parametrize(
+    "path",
+    [p if p.stem != "going-on" else pytest.param(p, marks=pytest.mark.slow) for p in SHIPPED],
+    ids=lambda p: p.stem,
+)
 def test_shipped_sweeps_could_start(tmp_path, path):
     sweep = load_sweep(path)
     assert sweep.name == path.stem

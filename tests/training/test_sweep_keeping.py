@@ -298,6 +298,7 @@ def test_another_checkpoint_that_was_kept_does_not_count(finished, kept, tmp_pat
         run.gauged(best)
 
 
+@pytest.mark.slow
 def test_the_shipped_folders_are_read(tmp_path):
     """The newest and the oldest."""
     for name in ("baselines", "from-nothing"):
