@@ -97,7 +97,7 @@ def test_longest_key_wins(write_hopper):
             "sdk_joint_names does not name each joint once",
         ),
         ("armature = 0.01\n", "", "parameters.soft lacks armature"),
-        ("armature = 0.01", "amature = 0.01", "unknown field 'parameters.soft.amature'; did you mean 'armature'?"),
+        ("armature = 0.01", "amature = 0.01", "unknown field 'parameters.soft.amature'; did you mean 'armature'"),
         ("armature = 0.01", "armature = true", "parameters.soft.armature[0] is True; it must be a number"),
         ("armature = 0.01", "armature = nan", "parameters.soft.armature[0] is nan; it must be a finite number"),
         ("armature = 0.01", 'armature = "0.01"', "parameters.soft.armature[0] is '0.01'; it must be a number"),

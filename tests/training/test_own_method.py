@@ -93,7 +93,7 @@ def test_an_own_method_trains_resumes_and_is_imported_where_it_is_trusted_only(t
             "broken_method:Late",
             r"'broken_method:Late', which raised ValueError: too late \(broken_method\.py, line 14\)",
         ),
-        ("broken_method:Undeployed", r"the deployed network is a 'mine'; allowed are mlp, cts, "),
+        ("broken_method:Undeployed", r"the deployed network is a 'mine'; allowed are mlp, recurrent, cts, "),
     ],
 )
 def test_a_method_that_does_not_fit_is_refused_with_one_sentence(tmp_path, name, reason):
