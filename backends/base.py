@@ -283,6 +283,7 @@ DESCRIPTION_KEYS: tuple[str, ...] = (
     "total_mass", "body_mass", "body_inertia",
     "joint_range", "joint_armature", "joint_damping", "joint_friction_loss",
     "stiffness", "damping", "torque_limit", "contact_friction",
+    "contact_dimension", "contact_torsion", "contact_rolling", "contact_cone", "contact_softness", "contact_restitution",
 )  # fmt: skip
 
 
@@ -420,7 +421,11 @@ class PhysicsBackend(ABC):
             moments of each body in rising order [kg·m²] (3 B); ``joint_range`` [rad], lower and upper limit of each joint
             (2 J); ``joint_armature`` [kg·m²], ``joint_damping`` [N·m·s/rad], ``joint_friction_loss`` [N·m], ``stiffness``
             [N·m/rad], ``damping`` [N·m·s/rad] and ``torque_limit`` [N·m], infinity for none (J each);
-            ``contact_friction``, the sliding coefficient that acts between each foot and the floor (F).
+            ``contact_friction``, the sliding coefficient that acts between each foot and the floor, ``contact_dimension`` (3
+            sliding, 4 with torsion, 6 with rolling), the coefficients ``contact_torsion`` and ``contact_rolling`` [m], 0 where they
+            do not act, ``contact_softness``, the time constant of the contact's spring [s], 0 for a hard contact, and
+            ``contact_restitution``, the share of the speed after a bounce (F each); ``contact_cone``, the number of faces of the
+            friction cone, infinity for a true one (1).
         """
         return None
 

@@ -12,7 +12,7 @@ from typing import Any
 from rich.text import Text
 
 from ..files.parsing import bare_name
-from ..studies.consistency.page import FIELD_LABELS, TESTS, cause, verdict, write_page
+from ..studies.consistency.page import FIELD_LABELS, TESTS, cause, difference_of_fields, verdict, write_page
 from ..studies.consistency.request import StudyRequest, StudyStatus
 from ..studies.consistency.study import prepare_study, study
 from ..studies.naming import joined_names
@@ -76,7 +76,7 @@ def print_study(console: Terminal, results: Mapping[str, Any]) -> None:
 
 def _print_models(console: Terminal, models: Mapping[str, Any], results: Mapping[str, Any]) -> None:
     labels = results["compared"]
-    title = f"models: largest relative difference from {models['reference']}"
+    title = f"models: the largest difference from {models['reference']}"
     table = make_table(title, "field", *labels, numbers=True)
     for key, row in models["fields"].items():
         cells: list[str | Text] = []
@@ -87,8 +87,7 @@ def _print_models(console: Terminal, models: Mapping[str, Any], results: Mapping
             elif found["agrees"]:
                 cells.append("same")
             else:
-                shown = "–" if found["relative"] is None else f"{found['relative']:.2g}"
-                cells.append(Text(f"{shown} ({found['entry']})", "red"))
+                cells.append(Text(difference_of_fields(found), "red"))
         table.add_row(FIELD_LABELS[key], *cells)
     if models["fields"]:
         console.print(table)

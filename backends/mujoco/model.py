@@ -14,7 +14,7 @@ import numpy as np
 from ...robots.base import Robot
 from ...terrains.base import Terrain
 from ..base import BackendError, Scene
-from ..description import ModelFields
+from ..description import FootContact, ModelFields
 
 CONTACT_SLOTS = 12
 """Ground contacts reported one by one, the strongest first; a robot that lies flat has about as many."""
@@ -210,4 +210,16 @@ def describe_model(model: mujoco.MjModel, robot: Robot) -> dict[str, list[float]
         foot_friction=model.geom_friction[feet, 0],
         floor_friction=float(model.geom_friction[floor, 0]),
         foot_priority=model.geom_priority[feet] - model.geom_priority[floor],
+        foot_contact=foot_contact(model, [*feet, floor]),
     ).describe()
+
+
+def foot_contact(model: mujoco.MjModel, geoms: list[int]) -> FootContact:
+    """Return the contacts of the feet, the geoms before the last, with the floor, which is the last."""
+    return FootContact.of_mujoco(
+        dimension=model.geom_condim[geoms],
+        friction=model.geom_friction[geoms],
+        softness=model.geom_solref[geoms],
+        priority=model.geom_priority[geoms],
+        pyramidal=model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL,
+    )

@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import mujoco
 import mujoco_warp
 import numpy as np
 import torch
 import warp as wp
 
 from ..base import SMALLEST_BASE_MASS
-from ..description import ModelFields
+from ..description import FootContact, ModelFields
 from ..warp.motors import MotorTensors
 from .model import SharedModel
 
@@ -98,4 +99,11 @@ def describe_model(model: mujoco_warp.Model, shared: SharedModel, motors: MotorT
         foot_friction=friction[feet, 0],
         floor_friction=float(friction[floor, 0]),
         foot_priority=priority[feet] - priority[floor],
+        foot_contact=FootContact.of_mujoco(
+            dimension=shared.model.geom_condim[[*feet, floor]],
+            friction=friction[[*feet, floor]],
+            softness=first("geom_solref")[[*feet, floor]],
+            priority=priority[[*feet, floor]],
+            pyramidal=shared.model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL,
+        ),
     ).describe()

@@ -262,4 +262,5 @@ class NewtonBackend(WarpBackend):
 
     def describe(self) -> Mapping[str, list[float]]:
         """See ``PhysicsBackend.describe``."""
-        return describe_newton(self.scene, self._world, self._motors, self._dry_friction.numpy())
+        dry, soft = self._dry_friction.numpy(), self.adapter.skin
+        return describe_newton(self.scene, self._world, self._motors, dry, soft=soft)

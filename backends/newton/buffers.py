@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+import mujoco
 import newton
 import numpy as np
 import torch
 import warp as wp
 
 from ..base import SMALLEST_BASE_MASS, Scene
-from ..description import ModelFields
+from ..description import FootContact, ModelFields
 from ..warp.motors import MotorTensors
 from ..warp.structures import filled
 from . import kernels
@@ -78,8 +79,15 @@ class MassTensors:
         adapter.inertia_changed()
 
 
-def describe_newton(scene: Scene, world: WorldModel, motors: MotorTensors, dry: np.ndarray) -> dict[str, list[float]]:
-    """Return the first world in the terms of ``PhysicsBackend.describe``; ``dry`` is the motor kernel's dry friction [N·m], (J,)."""
+def describe_newton(
+    scene: Scene, world: WorldModel, motors: MotorTensors, dry: np.ndarray, *, soft: bool
+) -> dict[str, list[float]]:
+    """Return the first world in the terms of ``PhysicsBackend.describe``.
+
+    Args:
+        dry: the motor kernel's dry friction [N·m], (J,).
+        soft: True for a solver with MuJoCo's contacts.
+    """
     model, layout = world.model, world.layout
     dofs, bodies = layout.joint_v, layout.collision_bodies
 
@@ -100,6 +108,19 @@ def describe_newton(scene: Scene, world: WorldModel, motors: MotorTensors, dry: 
         joint_damping=first("joint_damping", layout.dofs)[dofs],
         joint_friction_loss=np.maximum(dry, first("joint_friction", layout.dofs)[dofs]),
         **motors.described(),
+        foot_contact=_foot_contact(scene, world.reference) if soft else None,
         foot_friction=friction[feet],
         floor_friction=float(friction[floor]),
     ).describe()
+
+
+def _foot_contact(scene: Scene, reference: mujoco.MjModel) -> FootContact:
+    """Return the contacts of the feet with a plane of MuJoCo's default properties."""
+    feet = [reference.geom(name).id for name in scene.robot.foot_geoms]
+    return FootContact.of_mujoco(
+        dimension=[*reference.geom_condim[feet], 3],
+        friction=[*reference.geom_friction[feet], (1.0, 0.005, 0.0001)],
+        softness=[*reference.geom_solref[feet], (0.02, 1.0)],
+        priority=[*reference.geom_priority[feet], 0],
+        pyramidal=scene.physics.cone == "pyramidal",
+    )

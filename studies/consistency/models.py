@@ -23,9 +23,9 @@ def entry_names(key: str, robot: Robot) -> list[str]:
         return bodies if key == "body_mass" else [f"{b} {axis}" for b in bodies for axis in ("I1", "I2", "I3")]
     if key == "joint_range":
         return [f"{j} {end}" for j in robot.joint_names for end in ("low", "high")]
-    if key == "contact_friction":
+    if key.startswith("contact_") and key != "contact_cone":
         return list(robot.foot_names)
-    return [robot.name] if key == "total_mass" else list(robot.joint_names)
+    return [robot.name] if key in ("total_mass", "contact_cone") else list(robot.joint_names)
 
 
 def compare_models(robot: Robot, descriptions: Mapping[str, Description | None], reference: str) -> dict[str, Any]:
@@ -37,8 +37,8 @@ def compare_models(robot: Robot, descriptions: Mapping[str, Description | None],
 
     Returns:
         Plain data: ``fields`` by name with ``reference`` (mean of the entries' magnitudes, None for no limit) and, by variant,
-        ``largest`` absolute and ``relative`` difference, the ``entry`` where it is and whether it ``agrees`` to single
-        precision; ``not_described`` names the silent engines.
+        ``largest`` absolute and ``relative`` difference, the ``entry`` where it is, the two ``values`` there (None for no
+        limit) and whether it ``agrees`` to single precision; ``not_described`` names the silent engines.
     """
     silent = [label for label, found in descriptions.items() if found is None]
     others = {label: found for label, found in descriptions.items() if found is not None and label != reference}
@@ -58,7 +58,7 @@ def _difference(key: str, values: Sequence[float] | None, expected: np.ndarray, 
     found = np.asarray(values, dtype=np.float64)
     if found.shape != expected.shape:
         entry = f"{len(found)} entries instead of {len(expected)}"
-        return {"largest": None, "relative": None, "entry": entry, "agrees": False}
+        return {"values": None, "largest": None, "relative": None, "entry": entry, "agrees": False}
     with np.errstate(invalid="ignore"):  # a limit that only one of them has is an infinite difference
         absolute = np.where(found == expected, 0.0, np.abs(found - expected))
         scale = np.maximum(np.maximum(np.abs(found), np.abs(expected)), 1e-12)
@@ -66,6 +66,7 @@ def _difference(key: str, values: Sequence[float] | None, expected: np.ndarray, 
     worst = int(np.argmax(relative))
     names = entry_names(key, robot)
     return {
+        "values": [finite(expected[worst]), finite(found[worst])],
         "largest": finite(absolute.max()),
         "relative": finite(relative[worst]),
         "entry": names[worst] if worst < len(names) else str(worst),

@@ -34,7 +34,13 @@ FIELD_LABELS = {
     "stiffness": "motor stiffness [N·m/rad]",
     "damping": "motor damping [N·m·s/rad]",
     "torque_limit": "torque limit [N·m]",
-    "contact_friction": "friction that acts under the feet",
+    "contact_friction": "sliding friction under the feet",
+    "contact_dimension": "dimension of the feet's contacts",
+    "contact_torsion": "torsional friction under the feet [m]",
+    "contact_rolling": "rolling friction under the feet [m]",
+    "contact_cone": "faces of the friction cone",
+    "contact_softness": "time constant of the feet's contacts [s]",
+    "contact_restitution": "restitution of the feet",
 }
 
 
@@ -107,6 +113,14 @@ def _policy(block: Mapping[str, Any], reference: str, margin: float) -> dict[str
         "attribution": _attribution(block["attribution"]),
         "unhealthy": {k: v for k, v in block["health"].items() if v["diverged"] or v["overflowed"]},
     }
+
+
+def difference_of_fields(found: Mapping[str, Any]) -> str:
+    """Return the place of the largest difference between two models with both values: the other's, then the reference's."""
+    if found["values"] is None:
+        return str(found["entry"])
+    reference, other = ("none" if value is None else f"{value:.4g}" for value in found["values"])
+    return f"{other}, not {reference} ({found['entry']})"
 
 
 def verdict(overall: Mapping[str, Any], margin: float) -> str:
