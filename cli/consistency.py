@@ -61,6 +61,7 @@ def print_study(console: Terminal, results: Mapping[str, Any]) -> None:
         _print_open_loop(console, policy["open_loop"])
         for label, pair in policy["pairs"].items():
             _print_pair(console, results["reference"], label, pair)
+            _print_commands(console, results["reference"], label, pair["commands"])
         _print_attribution(console, policy["attribution"])
         _print_gaps(console, policy)
         for label, pair in policy["pairs"].items():
@@ -146,6 +147,18 @@ def _print_pair(console: Terminal, reference: str, label: str, pair: Mapping[str
             _range(row["difference"]["interval"]),
             "" if size is None else f"{size:+.2f}",
         )
+    console.print(table)
+
+
+def _print_commands(console: Terminal, reference: str, label: str, rows: Sequence[Mapping[str, Any]]) -> None:
+    if not rows:
+        return
+    table = make_table(
+        "largest differences in one command", "terrain", "command", "metric", reference, label, numbers=True
+    )
+    for row in rows:
+        values = (f"{row[key]:.4f}" for key in ("reference", "compared"))
+        table.add_row(row["terrain"], row["command"], row["metric"], *values)
     console.print(table)
 
 

@@ -33,10 +33,15 @@ def run_statistics(record: Record, column: int) -> Array:
 
     The quality of a goal counts for the share of the commanded motion that is done, where the suite measures it.
     """
+    return goal_statistics(record, column).mean(0)
+
+
+def goal_statistics(record: Record, column: int) -> Array:
+    """Return ``tail_means`` of one column in each goal of an episode, (goals, 3), as ``run_statistics`` averages them."""
     goals = range(len(record.episode.goals))
     if len(record.samples) == 0:
-        return np.zeros(3)
-    return np.mean([_statistics(record, column, record.goal_index == g) for g in goals], axis=0)
+        return np.zeros((len(goals), 3))
+    return np.array([_statistics(record, column, record.goal_index == g) for g in goals])
 
 
 def command_statistics(record: Record, column: int) -> dict[tuple[int, int], Array]:

@@ -18,25 +18,27 @@ import torch
 
 from ...backends.registry import engine_class
 from ...gauge.episodes import QUALITY, Episode, Record
-from ...gauge.goals import TARGET
+from ...gauge.goals import TARGET, command_name
 from ...gauge.plan import Records, plan_list
 from ...gauge.play.dispatcher import Dispatcher, Speculation, play
 from ...gauge.play.progress import ProgressMeter, Status
 from ...gauge.play.segments import count_segments
 from ...gauge.play.workers import Job, local_workers, start_workers
-from ...gauge.scoring import run_statistics
+from ...gauge.scoring import command_statistics, goal_statistics
 from ...gauge.suite import Suite
 from ...gauge.totals import environment_weights
 from ...policy.base import Policy
 from ...robots import Robot
 from .request import MARGIN
-from .statistics import Array, Estimate, effect_size, outcome_agreement, paired_mean
+from .statistics import UNDECIDED, Array, Estimate, by_goal, effect_size, outcome_agreement, paired_mean
 from .variants import Variant
 
 _WORLDS = 48
 """Worlds on the CPU."""
 _GPU_WORLDS = 8192
 """Worlds on a GPU, at most."""
+_LARGE, _MOST_COMMANDS = 0.05, 12
+"""Smallest difference of a metric in a command that is said, and how many are said at most."""
 _MEAN50 = 2
 """Position of mean@50 among ``scoring.STATISTICS``."""
 
@@ -132,16 +134,20 @@ def play_variant(
 
 @dataclass(frozen=True, kw_only=True)
 class Table:
-    """Mean@50 of each column in each episode: cells, seeds, columns."""
+    """Mean@50 of each column in each goal of each episode: cells, seeds, goals, columns."""
 
     values: Array
-    """(C, S, M)."""
+    """(C, S, G, M)."""
     columns: tuple[str, ...]
     """Metrics, then ``quality``."""
 
+    def goals(self, name: str) -> Array:
+        """One column, (C, S, G)."""
+        return self.values[..., self.columns.index(name)]
+
     def column(self, name: str) -> Array:
-        """One column, (C, S)."""
-        return self.values[:, :, self.columns.index(name)]
+        """One column, the mean over an episode's goals, (C, S)."""
+        return self.goals(name).mean(2)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -167,29 +173,32 @@ class Design:
         """Mean@50 of the quality episodes; an episode without samples counts zero, as in a score."""
         columns = (*self.suite.metrics.weights, QUALITY)
         rows = [[records[e] for e in episodes_of(c, self.suite, self.seeds) if e.stage == "eval"] for c in self.cells]
-        values = [[[run_statistics(r, m)[_MEAN50] for m in range(len(columns))] for r in row] for row in rows]
-        return Table(values=np.array(values, dtype=np.float64), columns=columns)
+        values = [[[goal_statistics(r, m)[:, _MEAN50] for m in range(len(columns))] for r in row] for row in rows]
+        return Table(values=np.array(values, dtype=np.float64).swapaxes(2, 3), columns=columns)
 
     def estimate(
         self, values: Array, name: str, rows: Sequence[int] | None = None, *, magnitude: bool = False
     ) -> Estimate:
-        """Mean and interval of paired values (C, S), or of magnitudes, over all cells or over some."""
-        chosen = range(len(self.cells)) if rows is None else rows
-        return paired_mean(
-            values[list(chosen)],
-            [self.cells[i].terrain for i in chosen],
-            shared=self.shared_draws,
-            resamples=self.suite.scoring.bootstrap,
-            name=name,
-            magnitude=magnitude,
-        )
+        """Mean and interval of paired values of episodes, (C, S), or of their goals, (C, S, G), over all cells or over some.
+
+        Magnitudes are those of whole episodes.
+        """
+        chosen = list(range(len(self.cells)) if rows is None else rows)
+        terrains, values = [self.cells[i].terrain for i in chosen], values[chosen]
+        settings: dict[str, Any] = {"resamples": self.suite.scoring.bootstrap, "name": name, "magnitude": magnitude}
+        if values.ndim == 2:
+            return paired_mean(values, terrains, shared=self.shared_draws, **settings)
+        rows_of_goals, weights = by_goal(values, terrains, shared=self.shared_draws)
+        return paired_mean(rows_of_goals, terrains, shared=False, weights=weights, **settings)
 
     def judged(
         self, values: Array, name: str, rows: Sequence[int] | None = None, *, key: str = "difference"
     ) -> dict[str, Any]:
-        """A signed estimate under its key, and its ``verdict``."""
+        """A signed estimate under its key, its ``verdict``, and the ``deciding_seeds`` of one that is undecided, as far as known."""
         found = self.estimate(values, name, rows)
-        return {key: found.plain(), "verdict": found.verdict(self.margin)}
+        verdict = found.verdict(self.margin)
+        seeds = found.deciding_seeds(self.margin) if verdict == UNDECIDED else None
+        return {key: found.plain(), "verdict": verdict, "deciding_seeds": seeds}
 
     def mean(self, values: Array, rows: Sequence[int] | None = None) -> float:
         """Return the mean of ``estimate`` alone."""
@@ -209,20 +218,22 @@ def compare(
     Returns:
         Plain data: ``overall`` and ``terrains``, each with ``gap`` (mean |Δ| of the quality's mean@50), ``difference`` (its
         signed mean, compared less reference) and its ``verdict``, the ``floor`` gap and the ``excess`` of the gap over it, the
-        metrics' signed differences and effect sizes, and how often falls and reached targets agree; ``episodes``, one row each.
+        metrics' signed differences and effect sizes, and how often falls and reached targets agree; ``commands``, the largest
+        differences of a metric in one command; ``episodes``, one row each.
     """
     first, second = design.table(reference), design.table(compared)
     chaos = _chaos(design, reference, floor) if floor else None
 
     def block(rows: Sequence[int], label: str) -> dict[str, Any]:
         key, picked = f"{name}/{label}", list(rows)
-        difference = second.column(QUALITY) - first.column(QUALITY)
+        of_goals = second.goals(QUALITY) - first.goals(QUALITY)
+        difference = of_goals.mean(2)
         gap = np.abs(difference)
         entry: dict[str, Any] = {
             "reference_score": design.mean(first.column(QUALITY), picked),
             "compared_score": design.mean(second.column(QUALITY), picked),
             "gap": design.estimate(gap, f"{key}/gap", picked, magnitude=True).plain(),
-            **design.judged(difference, f"{key}/difference", picked),
+            **design.judged(of_goals, f"{key}/difference", picked),
             "effect_size": effect_size(difference[picked]),
             "floor": None if chaos is None else design.estimate(chaos, f"{key}/floor", picked, magnitude=True).plain(),
             "excess": None if chaos is None else design.estimate(gap - chaos, f"{key}/excess", picked).plain(),
@@ -230,25 +241,29 @@ def compare(
             "outcomes": _outcomes(design, reference, compared, picked),
         }
         for metric in first.columns[:-1]:
-            shift = second.column(metric) - first.column(metric)
+            shift = second.goals(metric) - first.goals(metric)
             entry["metrics"][metric] = {
                 "reference": design.mean(first.column(metric), picked),
                 "compared": design.mean(second.column(metric), picked),
                 "difference": design.estimate(shift, f"{key}/{metric}", picked).plain(),
-                "effect_size": effect_size(shift[picked]),
+                "effect_size": effect_size(shift[picked].mean(2)),
             }
         return entry
 
-    return {**_by_terrain(design, block), "episodes": _rows(design, reference, compared, first, second)}
+    return {
+        **_by_terrain(design, block),
+        "commands": _commands(design, reference, compared),
+        "episodes": _rows(design, reference, compared, first, second),
+    }
 
 
 def gap_only(design: Design, first: Records, second: Records, name: str) -> dict[str, Any]:
     """The gap figure of two runs and its signed mean, overall and for each terrain."""
-    difference = design.table(second).column(QUALITY) - design.table(first).column(QUALITY)
+    difference = design.table(second).goals(QUALITY) - design.table(first).goals(QUALITY)
 
     def block(rows: Sequence[int], label: str) -> dict[str, Any]:
         return {
-            "gap": design.estimate(np.abs(difference), f"{name}/{label}/gap", rows, magnitude=True).plain(),
+            "gap": design.estimate(np.abs(difference.mean(2)), f"{name}/{label}/gap", rows, magnitude=True).plain(),
             **design.judged(difference, f"{name}/{label}/difference", rows),
         }
 
@@ -287,6 +302,27 @@ def _outcomes(design: Design, reference: Records, compared: Records, rows: Seque
         return outcome_agreement(first, second, [e.seed for e in chosen], shared=design.shared_draws)
 
     return {"fell": agreement("eval", lambda r: r.falls > 0), "reached": agreement("search", lambda r: bool(r.success))}
+
+
+def _commands(design: Design, reference: Records, compared: Records) -> list[dict[str, Any]]:
+    """Return the largest differences of a metric's mean@50 in a sub-command of a terrain, over its frictions, levels and seeds."""
+    rows: list[dict[str, Any]] = []
+    for terrain in dict.fromkeys(c.terrain for c in design.cells):
+        cells = [c for c in design.cells if c.terrain == terrain]
+        episodes = [e for c in cells for e in episodes_of(c, design.suite, design.seeds) if e.stage == "eval"]
+        for number, metric in enumerate(design.suite.metrics.weights):
+            pairs = [[command_statistics(records[e], number) for e in episodes] for records in (reference, compared)]
+            for goal, part in sorted(set().union(*map(set, (*pairs[0], *pairs[1])))):
+                both = [(a, b) for a, b in zip(*pairs, strict=True) if (goal, part) in a and (goal, part) in b]
+                values = np.array([[found[goal, part][_MEAN50] for found in pair] for pair in both])
+                if not len(values):
+                    continue
+                first, second = (float(v) for v in values.mean(0))
+                command = command_name(episodes[0].goals[goal], part)
+                entry = {"terrain": terrain, "command": command, "metric": metric}
+                rows.append(entry | {"reference": first, "compared": second, "difference": second - first})
+    rows = [row for row in rows if abs(row["difference"]) >= _LARGE]
+    return sorted(rows, key=lambda row: -abs(row["difference"]))[:_MOST_COMMANDS]
 
 
 def _rows(design: Design, reference: Records, compared: Records, first: Table, second: Table) -> list[dict[str, Any]]:

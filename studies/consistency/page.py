@@ -69,6 +69,7 @@ def render(results: Mapping[str, Any]) -> str:
         fixed=_fixed,
         short=_short,
         number=number,
+        model_difference=difference_of_fields,
         terrain=terrain_label,
         metric=metric_label,
     )
@@ -135,6 +136,10 @@ def verdict(overall: Mapping[str, Any], margin: float) -> str:
         text = f"The quality is {side} by {_fixed(abs(difference['value']))} ({where})"
     else:
         text = f"Whether the qualities differ is open: the difference lies between {_signed(low)} and {_signed(high)}"
+        seeds = overall["deciding_seeds"]
+        text += (
+            ", more than 1000 seeds would decide" if seeds is None else f"; about {seeds} seeds would decide (--seeds)"
+        )
     if excess is None:
         return text + "."
     low, high = excess["interval"]

@@ -22,6 +22,7 @@ from ...gauge.totals import environment_weights
 Array = NDArray[np.float64]
 
 EQUIVALENT, DIFFERENT, UNDECIDED = "equivalent", "different", "undecided"
+_MOST_SEEDS = 1000
 _TINY = 1e-12
 """Spread below which differences count as all the same."""
 
@@ -33,6 +34,21 @@ class Estimate:
     value: float
     low: float
     high: float
+    error: float = 0.0
+    """Standard error of the mean."""
+    freedom: float = math.inf
+    """Degrees of freedom of the error."""
+    seeds: int = 0
+    """Number of seeds that it is made of."""
+
+    def deciding_seeds(self, margin: float) -> int | None:
+        """Return how many seeds would make a verdict of the same difference and scatter; None beyond ``_MOST_SEEDS``."""
+        aim = max(abs(self.value), margin - abs(self.value))
+        for seeds in range(max(self.seeds, 2), _MOST_SEEDS + 1):
+            freedom = self.freedom * (seeds - 1) / max(self.seeds - 1, 1)
+            if stats.t.ppf(0.5 + 0.5 * CONFIDENCE, freedom) * self.error * math.sqrt(self.seeds / seeds) < aim:
+                return seeds
+        return None
 
     def verdict(self, margin: float) -> str:
         """What the interval allows to say: ``equivalent`` where all of it lies within the margin, ``different`` where it leaves
@@ -103,8 +119,30 @@ def replicates(values: Array, weights: Array, *, shared: bool, resamples: int, n
     return total
 
 
+def by_goal(values: Array, terrains: Sequence[str], *, shared: bool) -> tuple[Array, Array]:
+    """Return paired values of the goals of episodes as independent rows, (R, S), and their weights, (R,).
+
+    Each goal of an episode has noise of its own, so that its scatter over the seeds says something more of the mean's. Where
+    episodes of a seed share their random numbers, a row is one goal over all environments, else a goal of an environment.
+
+    Args:
+        values: (E, S, G).
+    """
+    weights, goals = environment_weights(terrains), values.shape[2]
+    if shared:
+        return np.einsum("e,esg->gs", weights, values), np.full(goals, 1.0 / goals)
+    return values.transpose(0, 2, 1).reshape(-1, values.shape[1]), np.repeat(weights / goals, goals)
+
+
 def paired_mean(
-    values: Array, terrains: Sequence[str], *, shared: bool, resamples: int, name: str, magnitude: bool = False
+    values: Array,
+    terrains: Sequence[str],
+    *,
+    shared: bool,
+    resamples: int,
+    name: str,
+    magnitude: bool = False,
+    weights: Array | None = None,
 ) -> Estimate:
     """Mean of paired values over terrains, their environments and the seeds, with its 95 % interval.
 
@@ -116,13 +154,14 @@ def paired_mean(
         terrains: terrain of each environment.
         shared, resamples, name: see ``replicates``.
         magnitude: the values are magnitudes, so that the interval ends at zero.
+        weights: of the rows, (E,), in place of the terrains'.
 
     Raises:
         ValueError: fewer than two seeds, from which no spread can be seen.
     """
     if values.shape[1] < 2:
         raise ValueError(f"an interval needs at least 2 seeds, not {values.shape[1]}")
-    weights = environment_weights(terrains)
+    weights = environment_weights(terrains) if weights is None else weights
     mean = float(weights @ values.mean(1))
     error, freedom = spread_of_mean(values, weights, shared=shared)
     draws = replicates(values, weights, shared=shared, resamples=resamples, name=name)
@@ -130,7 +169,8 @@ def paired_mean(
     low, high = (float(q) for q in np.quantile(draws, [tail, 1.0 - tail]))
     reach = float(stats.t.ppf(0.5 + 0.5 * CONFIDENCE, freedom)) * error
     low, high = min(low, mean - reach), max(high, mean + reach)
-    return Estimate(value=mean, low=max(low, 0.0) if magnitude else low, high=high)
+    seeds, low = values.shape[1], max(low, 0.0) if magnitude else low
+    return Estimate(value=mean, low=low, high=high, error=error, freedom=freedom, seeds=seeds)
 
 
 def effect_size(differences: Array) -> float | None:

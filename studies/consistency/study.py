@@ -35,7 +35,7 @@ from .open_loop import Trajectory, compare_trajectories, record_targets, replay
 from .request import ConsistencyError, StudyRequest, StudyStatus
 from .variants import Variant, parse_variant, place
 
-SCHEMA = 2
+SCHEMA = 3
 LEVEL = 3
 """Level of terrains that have levels, where none is asked for."""
 SEEDS_CPU, SEEDS_GPU = 3, 10
