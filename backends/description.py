@@ -60,7 +60,8 @@ class FootContact:
             return np.where(first > 0, feet, np.where(first < 0, floor, mix(feet, floor)))
 
         size, coefficients = combined(dimension, np.maximum), combined(friction, np.maximum)
-        constant, ratio = combined(softness, lambda a, b: 0.5 * (a + b)).T
+        usual = (np.asarray(softness)[:, :1] > 0).all()
+        constant, ratio = combined(softness, lambda a, b: 0.5 * (a + b) if usual else np.minimum(a, b)).T
         # negative numbers are stiffness and damping
         constant, ratio = np.where(constant < 0, -2.0 / ratio, constant), np.where(constant < 0, 1.0, ratio)
         damped = np.clip(ratio, 0.0, 1.0 - 1e-12)

@@ -163,6 +163,10 @@ def test_models_differ_where_randomization_made_them():
     assert mass["entry"] == "base_link"
     assert mass["largest"] == pytest.approx(2.0)
     assert found["not_described"] == ["mute"]
+    assert first["contact_dimension"] == [6.0] * 4 and first["contact_torsion"] == pytest.approx([0.02] * 4)
+    free = compare_models(GO2, {"a": first, "free": first | {"contact_torsion": [0.0] * 4}}, "a")
+    torsion = free["fields"]["contact_torsion"]["variants"]["free"]
+    assert torsion["values"] == pytest.approx([0.02, 0.0]) and not torsion["agrees"]
     for key, values in first.items():
         assert len(entry_names(key, GO2)) == len(values), key
 

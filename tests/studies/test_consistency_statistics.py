@@ -1,15 +1,18 @@
 """Known answers of the paired statistics."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from gaitgauge.backends.description import FootContact
 from gaitgauge.gauge.totals import environment_weights
 from gaitgauge.studies.consistency.statistics import (
     DIFFERENT,
     EQUIVALENT,
     UNDECIDED,
     Estimate,
+    by_goal,
     effect_size,
     outcome_agreement,
     paired_mean,
@@ -197,3 +200,39 @@ def test_shares_of_clusters_are_covered():
 )
 def test_no_difference_is_said_only_where_none_that_matters_can_hide(low, high, word):
     assert Estimate(value=(low + high) / 2, low=low, high=high).verdict(0.02) == word
+
+
+def test_goals_are_rows_of_their_own():
+    # two environments, two seeds, two goals; terrains of one weight
+    values = np.array([[[1.0, 10.0], [3.0, 10.0]], [[5.0, 20.0], [7.0, 20.0]]])
+    rows, weights = by_goal(values, ["flat", "wave"], shared=True)
+    assert rows == pytest.approx(np.array([[3.0, 5.0], [15.0, 15.0]]))  # a goal over both environments, by seed
+    assert weights == pytest.approx([0.5, 0.5])
+    rows, weights = by_goal(values, ["flat", "wave"], shared=False)
+    assert rows == pytest.approx(np.array([[1.0, 3.0], [10.0, 10.0], [5.0, 7.0], [20.0, 20.0]]))
+    assert weights == pytest.approx([0.25] * 4)
+    assert float(weights @ rows.mean(1)) == pytest.approx(values.mean())
+
+
+def test_how_many_seeds_would_decide():
+    # t(0.975, 4) = 2.776 and 2.776 * 0.04 * sqrt(2 / 5) = 0.0702; with 4 seeds it is 3.182 * 0.0283 = 0.090
+    wide = Estimate(value=0.08, low=-0.43, high=0.59, error=0.04, freedom=1.0, seeds=2)
+    assert wide.verdict(0.01) == UNDECIDED and wide.deciding_seeds(0.01) == 5
+    assert replace(wide, value=1e-6).deciding_seeds(0.5) < replace(wide, value=1e-6).deciding_seeds(0.05)
+    assert replace(wide, value=0.0).deciding_seeds(1e-6) is None
+
+
+def test_contacts_of_mujoco_are_combined_as_mujoco_does():
+    # two feet and a floor: the first foot has priority, the second meets the floor as an equal
+    found = FootContact.of_mujoco(
+        dimension=[6, 1, 3],
+        friction=[[0.4, 0.02, 0.01], [0.4, 0.02, 0.01], [1.0, 0.005, 0.0001]],
+        softness=[[0.01, 0.5], [-400.0, -100.0], [0.02, 1.0]],
+        priority=[1, 0, 0],
+        pyramidal=True,
+    )
+    assert list(found.dimension) == [6, 3] and found.cone == 4.0
+    assert list(found.torsion) == [0.02, 0.0] and list(found.rolling) == [0.01, 0.0]
+    assert found.softness[0] == 0.01
+    # damping ratio 0.5: exp(-pi 0.5 / sqrt(0.75)) of the speed comes back
+    assert found.restitution[0] == pytest.approx(0.16303, abs=1e-5)

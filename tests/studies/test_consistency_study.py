@@ -406,7 +406,7 @@ def judged(difference, excess, verdict_word):
         name: {"value": sum(ends) / 2, "interval": list(ends)}
         for name, ends in (("difference", difference), ("excess", excess))
     }
-    return verdict({**estimates, "verdict": verdict_word}, 0.02)
+    return verdict({**estimates, "verdict": verdict_word, "deciding_seeds": 7}, 0.02)
 
 
 def test_two_seeds_do_not_say_no_more_than_chaos():
@@ -414,6 +414,7 @@ def test_two_seeds_do_not_say_no_more_than_chaos():
     text = judged((-0.2, 0.25), (-0.3, 0.31), "undecided")
     assert "no more than" not in text
     assert "Whether the qualities differ is open" in text and "may differ by up to 0.3100 more" in text
+    assert "about 7 seeds would decide" in text
 
 
 def test_no_difference_is_said_within_the_margin_alone():
