@@ -305,6 +305,9 @@ class PhysicsBackend(ABC):
     parallel_processes: ClassVar[bool] = False
     """True for an engine on the CPU that plays faster as one process a core than as one process with threads. Several processes may
     then build worlds at the same time, here and on a cluster; results may not depend on their number."""
+    torque_motors: ClassVar[bool] = False
+    """True for an engine that knows ``motor = "torque"``: a joint's target is its motor's torque [N·m], before limits and
+    strength. Motors by network need it."""
     state_stays: ClassVar[bool] = False
     """True where ``state`` is always the same tensors, in float32, which every call changes in place."""
     engine_seconds: float | None = None

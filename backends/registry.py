@@ -14,7 +14,7 @@ from importlib.util import find_spec
 
 from ..files.parsing import one_line, shown
 from ..files.plugins import guarded, load_plugin, origin, plugins
-from .base import BackendError, DeviceError, PhysicsBackend, Scene, Support
+from .base import BackendError, DeviceError, PhysicsBackend, Randomization, Scene, Support
 
 GROUP = "gaitgauge.backends"
 
@@ -207,14 +207,24 @@ def _can_use_gpu(found: type[PhysicsBackend]) -> bool:
 
 
 def make_backend(name: str, scene: Scene, *, device: str = "cpu", threads: int = 1) -> PhysicsBackend:
-    """Build the worlds of ``scene`` in the engine ``name`` (``mujoco``, ``newton:steel`` …).
+    """Build the worlds of ``scene`` in the engine ``name`` (``mujoco``, ``newton:steel`` …), with its offsets and motors by network.
 
     Raises:
         BackendError: unknown engine, missing package, or a scene that the engine cannot simulate.
     """
     found, plugin = engine_class(name), plugins(GROUP).get(name.partition(":")[0])
     build = partial(found, scene, device=device, threads=threads)
-    return build() if plugin is None or name.partition(":")[0] in _OWN else guarded(plugin, BackendError, build)
+    if scene.parameters.motor == "network":
+        from .network_motors import NetworkMotors
+
+        build = partial(NetworkMotors, scene, device=device, threads=threads, engine=found)
+    made = build() if plugin is None or name.partition(":")[0] in _OWN else guarded(plugin, BackendError, build)
+    if scene.parameters.target_offset is not None:
+        import torch
+
+        offset = torch.tensor([scene.parameters.target_offset], dtype=made.dtype, device=made.device)
+        made.randomize(Randomization(motor_offset=offset.repeat(made.num_worlds, 1)))
+    return made
 
 
 def engine_class(name: str) -> type[PhysicsBackend]:

@@ -18,9 +18,9 @@ from typing import Any
 
 import numpy as np
 from gaitgauge.robots import JointParameters, Robot, load_robot
+from gaitgauge.robots.sets import joint_groups
 from gaitgauge.studies.reality.chirp import Chirp, simulated_log
 from gaitgauge.studies.reality.identification import KINDS, Fit, identify
-from gaitgauge.studies.reality.residuals import joint_groups
 
 RANGES = {
     "armature": (0.005, 0.03),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import Field
 
@@ -66,6 +66,11 @@ class JointParameters:
     """Angle that the motor adds to its target [rad]: errors of its zero and of the pose; None for 0."""
     delay: Annotated[float, Field(ge=0.0, le=0.1)] | None = None
     """Time from sending a target until it acts [s]; None where it was not measured."""
+    motor: Literal["law", "network", "torque"] = "law"
+    """``law``: the motor law above; ``network``: the network of ``network``, which knows no gains; ``torque``: what is commanded
+    is the torque [N·m], before limits and strength."""
+    network: Annotated[str, Field(min_length=1, max_length=4000)] | None = None
+    """Path of the network's file (``gaitgauge robot motor``)."""
     measured: Annotated[str, Field(min_length=1, max_length=4000)] | None = None
     """Provenance of a set that was measured: recordings, method, version. Such a set does not count for the robot's digest."""
 

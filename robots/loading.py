@@ -33,9 +33,9 @@ _MOST_ELEMENTS, _MOST_CELLS = 10_000, 4_000_000
 """Most elements of all files, and most points of a height field, a texture or a mesh that MuJoCo makes itself."""
 _CELLS = {"hfield": ("nrow", "ncol"), "texture": ("width", "height"), "mesh": ("params",)}
 _JOINT_ENDING = "_joint"
-PER_JOINT = tuple(f.name for f in fields(JointParameters) if f.name not in ("delay", "measured"))
+PER_JOINT = tuple(f.name for f in fields(JointParameters) if f.name not in ("delay", "motor", "network", "measured"))
 """Fields of a parameter set with a value for each joint."""
-_MEASURED = ("stiffness_factor", "damping_factor", "target_offset", "delay", "measured")
+_MEASURED = ("stiffness_factor", "damping_factor", "target_offset", "delay", "network", "measured")
 _ADDED_LATER = ("foot_shapes", "action_scale", "imu_site")
 """Fields that count for a robot's digest only where set, so that digests of older descriptions stay."""
 
@@ -67,6 +67,7 @@ def load_robot_file(path: str | Path) -> Robot:
         sets = data.get("parameters")
         for name, table in sets.items() if isinstance(sets, dict) else ():
             if isinstance(table, dict):
+                _place_network(table, file.parent)
                 _spread(table, PER_JOINT, names, f"{source}: parameters.{name}")
     elif isinstance(names, list):
         raise RobotError(f"{source}: joint_names must hold names, each once")
@@ -77,11 +78,18 @@ def load_robot_file(path: str | Path) -> Robot:
     return robot
 
 
-def parameter_set(robot: Robot, table: Any, source: str) -> JointParameters:
-    """Return a ``[parameters.NAME]`` table of another file as a parameter set of the robot; raise ``RobotError`` where it is wrong."""
+def _place_network(table: dict[str, Any], folder: Path) -> None:
+    """Let a relative path of a network lead from the folder of its description."""
+    if isinstance(table.get("network"), str):
+        table["network"] = str(folder.resolve() / table["network"])
+
+
+def parameter_set(robot: Robot, table: Any, source: str, *, folder: Path) -> JointParameters:
+    """Return a ``[parameters.NAME]`` table of a file in ``folder`` as a parameter set of the robot; ``RobotError``: it is wrong."""
     if not isinstance(table, dict):
         raise RobotError(f"{source} is {shown(table)}; it must be a table")
     table = dict(table)
+    _place_network(table, folder)
     _spread(table, PER_JOINT, list(robot.joint_names), source)
     found = build(JointParameters, table, source, RobotError)
     for key in PER_JOINT:
@@ -108,7 +116,7 @@ def robot_digest(robot: Robot) -> str:
     """
     description = {k: v for k, v in asdict(robot).items() if k != "mjcf" and not (v is None and k in _ADDED_LATER)}
     description["parameters"] = {
-        name: {k: v for k, v in table.items() if not (v is None and k in _MEASURED)}
+        name: {k: v for k, v in table.items() if k != "motor" and not (v is None and k in _MEASURED)}
         for name, table in description["parameters"].items()
         if table["measured"] is None
     }
@@ -303,6 +311,10 @@ def _check(robot: Robot, source: str) -> None:
 
 def _check_motors(constants: JointParameters, joints: tuple[str, ...], where: str) -> None:
     """Refuse an incomplete or rising curve of torque over speed."""
+    if (constants.motor == "network") != (constants.network is not None):
+        raise RobotError(f'{where}motor = "network" and network, its file, belong together; give both or neither')
+    if constants.motor != "law" and constants.measured is None:
+        raise RobotError(f"{where}motor is {shown(constants.motor)} without measured; say where the motors come from")
     full, none, driving = constants.full_torque_speed, constants.no_load_speed, constants.driving_torque_limit
     if (full is None) != (none is None):
         raise RobotError(f"{where}full_torque_speed and no_load_speed belong together; give both or neither")

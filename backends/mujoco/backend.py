@@ -49,6 +49,7 @@ Array = NDArray[np.float64]
 class MujocoBackend(PhysicsBackend):
     """MuJoCo (C engine) on the CPU. Results do not depend on the number of threads nor on the other worlds."""
 
+    torque_motors: ClassVar[bool] = True
     name: ClassVar[str] = "mujoco"
     family: ClassVar[str] = "MuJoCo"
     parallel_processes: ClassVar[bool] = True
@@ -68,7 +69,7 @@ class MujocoBackend(PhysicsBackend):
         self.scene = scene
         self.dtype = torch.float64
         n, joints = scene.num_worlds, scene.robot.num_joints
-        self._limits = MotorLimits.of(scene)
+        self._limits, self._direct = MotorLimits.of(scene), scene.parameters.motor == "torque"
         self._palette = build_models(scene)
         self._terrain = np.asarray(scene.terrain_index, dtype=np.int64)
         nominal = self._palette[0]
@@ -274,7 +275,7 @@ class MujocoBackend(PhysicsBackend):
         parts = []
         for substep in range(control.shape[1]):
             position, velocity = self._qpos[np.ix_(rows, self._joint_q)], self._qvel[np.ix_(rows, self._joint_v)]
-            free = position + self._kd_over_kp[rows] * velocity
+            free = 0.0 if self._direct else position + self._kd_over_kp[rows] * velocity
             target = control[:, substep]
             if self._limits.by_speed:
                 gain, strength = self._gain[rows], self._strength[rows]
@@ -368,7 +369,7 @@ class MujocoBackend(PhysicsBackend):
         ones = np.ones(self.scene.robot.num_joints)
         strength = values.get("motor_strength", ones)
         model.actuator_gainprm[:, 0] = nominal.actuator_gainprm[:, 0] * values.get("stiffness_scale", ones) * strength
-        model.actuator_biasprm[:, 1] = -model.actuator_gainprm[:, 0]
+        model.actuator_biasprm[:, 1] = 0.0 if self._direct else -model.actuator_gainprm[:, 0]
         model.actuator_biasprm[:, 2] = nominal.actuator_biasprm[:, 2] * values.get("damping_scale", ones) * strength
         model.actuator_forcerange[:] = nominal.actuator_forcerange * strength[:, None]
         self._speed[row] = values.get("motor_speed", 1.0)

@@ -77,12 +77,13 @@ def _set_motors(spec: mujoco.MjSpec, scene: Scene) -> None:
     limits = scene.parameters.torque_limit
     for j, name in enumerate(scene.robot.joint_names):
         kp, kd = scene.parameters.stiffness[j], scene.parameters.damping[j]
+        direct = scene.parameters.motor == "torque"
         motor = spec.add_actuator(name=f"motor_{name}", target=name)
         motor.trntype = mujoco.mjtTrn.mjTRN_JOINT
         motor.gaintype = mujoco.mjtGain.mjGAIN_FIXED
         motor.biastype = mujoco.mjtBias.mjBIAS_AFFINE
-        motor.gainprm[0] = kp
-        motor.biasprm[:3] = (0.0, -kp, -kd)
+        motor.gainprm[0] = 1.0 if direct else kp
+        motor.biasprm[:3] = (0.0, 0.0, 0.0) if direct else (0.0, -kp, -kd)
         motor.ctrllimited = mujoco.mjtLimited.mjLIMITED_FALSE
         if scene.physics.torque_limits:
             motor.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE

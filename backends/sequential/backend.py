@@ -51,6 +51,7 @@ class SequentialBackend(PhysicsBackend):
     its reset.
     """
 
+    torque_motors: ClassVar[bool] = True
     parallel_processes: ClassVar[bool] = True
     precision: ClassVar[torch.dtype] = torch.float64
     """Floating-point type of the engine."""
@@ -75,7 +76,7 @@ class SequentialBackend(PhysicsBackend):
         n, joints, physics = scene.num_worlds, scene.robot.num_joints, scene.physics
         self.robot: RobotModel = read_robot(scene)
         self._kp, self._kd = np.asarray(scene.parameters.stiffness), np.asarray(scene.parameters.damping)
-        self._limits = MotorLimits.of(scene)
+        self._limits, self._direct = MotorLimits.of(scene), scene.parameters.motor == "torque"
         self._dry = np.zeros(joints) if self.own_dry_friction else np.asarray(scene.parameters.friction_loss)
         self._motors = {name: np.full((n, joints), float(name != "motor_offset")) for name in _MOTOR_FIELDS}
         self._changes: list[dict[str, Array]] = [{} for _ in range(n)]
@@ -230,10 +231,10 @@ class SequentialBackend(PhysicsBackend):
         if not self._limp[row]:
             factors = {name: values[row] for name, values in self._motors.items()}
             torque = motor_torque(
-                self._target[row] + factors["motor_offset"] - position,
+                self._target[row] if self._direct else self._target[row] + factors["motor_offset"] - position,
                 velocity,
-                stiffness=self._kp * factors["stiffness_scale"],
-                damping=self._kd * factors["damping_scale"],
+                stiffness=1.0 if self._direct else self._kp * factors["stiffness_scale"],
+                damping=0.0 if self._direct else self._kd * factors["damping_scale"],
                 strength=factors["motor_strength"],
                 speed=factors["motor_speed"],
                 limits=self._limits,

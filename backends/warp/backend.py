@@ -26,6 +26,7 @@ from .state import StateArrays, allocate_state, clear_forces
 class WarpBackend(PhysicsBackend):
     """N worlds on Warp. An engine adds its model and kernels."""
 
+    torque_motors: ClassVar[bool] = True
     always_masked: ClassVar[bool] = False
     """True where every control period puts aside worlds that must not step, so that one graph serves all masks."""
 

@@ -23,6 +23,8 @@ class Motors:
     no_load_speed: wp.array[float]
     fall: wp.array[float]
     """Limits as in ``MotorLimits``, (J,)."""
+    direct: int
+    """1 where a target is the torque itself."""
     stiffness: wp.array2d[float]
     damping: wp.array2d[float]
     strength: wp.array2d[float]
@@ -64,6 +66,7 @@ class MotorTensors:
         self.delay = torch.zeros(shape[0], dtype=torch.int32, device=device)
         """Number of substeps of the previous target, (N,)."""
         self.arrays = arrays = Motors()
+        arrays.direct = int(scene.parameters.motor == "torque")
         for name in ("torque_limit", "stiffness", "damping", "strength", "speed", "offset", "requested", "delay"):
             setattr(arrays, name, wp.from_torch(getattr(self, name)))
         self._limits = [tensor(getattr(limits, name)) for name in ("driving", "no_load_speed", "fall")]
@@ -130,6 +133,8 @@ def motor_torque(motors: Motors, world: int, joint: int, substep: int, position:
         return 0.0
     error = target + motors.offset[world, joint] - position
     torque = motors.stiffness[world, joint] * error - motors.damping[world, joint] * velocity
+    if motors.direct != 0:
+        torque = target
     if wp.isnan(torque):
         return torque
     turning = wp.abs(velocity) / motors.speed[world, joint]

@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...robots import JointParameters
+from ...robots.sets import joint_groups
 from .log import Array, Log, LogError
-from .residuals import BLOCK, SETTLING, Squares, differences, joint_groups
+from .residuals import BLOCK, SETTLING, Squares, differences
 from .rig import FixedRig, Motion, acting_parameters, at_rows, beginning, held_targets, num_steps
 
 _ROWS_PER_SECOND = 100.0

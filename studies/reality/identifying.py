@@ -16,6 +16,7 @@ from ...files.provenance import provenance
 from ...files.writing import json_text, write_files
 from ...robots import JointParameters
 from ...robots.loading import PER_JOINT
+from ...robots.sets import find_set, set_text
 from ...version import __version__
 from .identification import KINDS, Fit, held_out_ratios, identify
 from .log import Log, LogError
@@ -23,7 +24,6 @@ from .page import render_identified
 from .replaying import check_torque, fit_delay, hung_or_standing, read_logs
 from .request import IdentifyRequest
 from .rig import FixedRig, Motion, acting_parameters, at_rows, beginning, held_targets, num_steps
-from .sets import find_set, set_text
 
 Watch = Callable[[int, int, str], None]
 

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 
 from ...gauge.report.pages import page_template
+from ...robots.sets import joint_groups
 from .log import Array, Log
-from .residuals import BANDS, joint_groups, spectrum
+from .residuals import BANDS, spectrum
 from .rig import Motion
 
 WIDTH, HEIGHT, LEFT, RIGHT, TOP, BOTTOM = 560.0, 190.0, 48.0, 8.0, 8.0, 30.0

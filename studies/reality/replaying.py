@@ -15,13 +15,13 @@ from ...files.choices import cpu_threads
 from ...files.provenance import provenance
 from ...files.writing import json_text, write_files
 from ...robots import JointParameters
+from ...robots.sets import find_set, joint_groups
 from .log import Log, LogError, inverse_torque
 from .page import render_page, traces
 from .readers import read_log, read_map
 from .request import LogOptions, ReplayRequest
-from .residuals import differences, joint_groups, noise, repeatability, summarize
+from .residuals import differences, noise, repeatability, summarize
 from .rig import FixedRig, Motion, acting_parameters, at_rows, beginning, held_targets, num_steps, play
-from .sets import find_set
 
 Watch = Callable[[int, int, str], None]
 LONGEST_DELAY = 0.03

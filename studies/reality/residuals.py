@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...robots import Robot
+from ...robots.sets import joint_groups
 from .log import Array, Log
 from .rig import Motion
 
@@ -21,14 +21,6 @@ SETTLING = 0.1
 """Time at the start that is not counted [s], while the unknown velocity at the first row dies away."""
 _DRAWS = 1000
 _NOISE_ROWS = 7
-
-
-def joint_groups(robot: Robot) -> dict[str, list[int]]:
-    """Return the joints of each kind: ``hip`` holds the places of all joints whose name ends in it after the leg's name."""
-    groups: dict[str, list[int]] = {}
-    for place, name in enumerate(robot.joint_names):
-        groups.setdefault(name.removesuffix("_joint").partition("_")[2] or name, []).append(place)
-    return groups
 
 
 def differences(log: Log, motion: Motion) -> dict[str, Array]:

@@ -7,12 +7,12 @@ import identification_coverage as coverage
 import numpy as np
 import pytest
 from gaitgauge.robots import RobotError, load_robot
+from gaitgauge.robots.sets import find_set
 from gaitgauge.studies.reality.chirp import Chirp, simulated_log
 from gaitgauge.studies.reality.identification import identify
 from gaitgauge.studies.reality.identifying import identify_robot
 from gaitgauge.studies.reality.log import LogError, save_log
 from gaitgauge.studies.reality.request import IdentifyRequest
-from gaitgauge.studies.reality.sets import find_set
 
 GO2 = load_robot("go2", check=False)
 NOMINAL = GO2.parameters["gauge"]

@@ -6,11 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from gaitgauge.robots import load_robot
+from gaitgauge.robots.sets import joint_groups
 from gaitgauge.studies.reality.chirp import Chirp, simulated_log
 from gaitgauge.studies.reality.log import LogError, save_log
 from gaitgauge.studies.reality.replaying import fit_delay, replay
 from gaitgauge.studies.reality.request import ReplayRequest
-from gaitgauge.studies.reality.residuals import Squares, by_band, joint_groups, noise, spectrum
+from gaitgauge.studies.reality.residuals import Squares, by_band, noise, spectrum
 from gaitgauge.studies.reality.rig import FixedRig, acting_parameters, at_rows, beginning, held_targets, num_steps, play
 
 GO2 = load_robot("go2", check=False)

@@ -6,9 +6,17 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ...files.parsing import one_line, parse_toml, read_text
-from ...robots import JointParameters, Robot, RobotError
-from ...robots.loading import parameter_set
+from ..files.parsing import one_line, parse_toml, read_text
+from .base import JointParameters, Robot
+from .loading import RobotError, parameter_set
+
+
+def joint_groups(robot: Robot) -> dict[str, list[int]]:
+    """Return the joints of each kind: ``hip`` holds the places of all joints whose name ends in it after the leg's name."""
+    groups: dict[str, list[int]] = {}
+    for place, name in enumerate(robot.joint_names):
+        groups.setdefault(name.removesuffix("_joint").partition("_")[2] or name, []).append(place)
+    return groups
 
 
 def find_set(robot: Robot, name: str | None) -> tuple[str, JointParameters]:
@@ -43,7 +51,7 @@ def find_set(robot: Robot, name: str | None) -> tuple[str, JointParameters]:
     wanted = wanted or next(iter(tables))
     if wanted not in tables:
         raise RobotError(f"{source} holds {', '.join(tables)}, not '{one_line(wanted, 80)}'")
-    return wanted, parameter_set(robot, tables[wanted], f"{source}: parameters.{wanted}")
+    return wanted, parameter_set(robot, tables[wanted], f"{source}: parameters.{wanted}", folder=file.parent)
 
 
 def set_text(robot: Robot, name: str, values: Mapping[str, Any], provenance: str, *, notes: Sequence[str] = ()) -> str:
@@ -55,8 +63,6 @@ def set_text(robot: Robot, name: str, values: Mapping[str, Any], provenance: str
         provenance: becomes ``measured``.
         notes: become comments.
     """
-    from .residuals import joint_groups
-
     groups = joint_groups(robot)
     lines = [f"# {line}" for note in notes for line in note.splitlines()]
     lines += [f'robot = "{robot.name}"', "", f"[parameters.{name}]"]
