@@ -14,7 +14,7 @@ from typer.core import TyperArgument, TyperGroup, TyperOption
 COMMAND_GROUPS: Mapping[str, tuple[str, ...]] = {
     "Judge": ("evaluate", "compare", "verify", "board"),
     "Study": ("jury", "consistency", "validate", "trial", "latent", "sweep"),
-    "Real robots": ("replay", "identify", "preflight"),
+    "Real robots": ("replay", "identify", "measured", "preflight"),
     "Learn": ("train",),
     "Use": ("play", "export", "import", "contract"),
     "Look": ("list", "doctor", "robot", "warmup"),

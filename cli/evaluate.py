@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable, Sequence
 from contextlib import redirect_stdout
 from pathlib import Path
+from typing import Any
 
 from rich.text import Text
 
@@ -35,7 +36,8 @@ SLOWER = (
 def run_evaluation(request: Request, *, out: Path | None, resume: bool, clip: bool, json_output: bool) -> None:
     """Evaluate, show progress, film the robot, print the tables and where the files are."""
     prepared = prepare(request)  # all that can be wrong with the request is said before anything is written
-    folder = out or run_folders([request.policy], Path("results"), suite=request.suite, pipeline=request.pipeline)[0]
+    names: Any = {"suite": request.suite, "pipeline": request.pipeline, "parameters": request.parameters}
+    folder = out or run_folders([request.policy], Path("results"), **names)[0]
     console = Terminal(stderr=True)
     # Ray prints its nodes' logs to standard output; that a worker was lost is one of the notices
     quiet = redirect_stdout(io.StringIO() if request.cluster else sys.stdout)

@@ -7,13 +7,19 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from ..gauge.request import EvaluationOptions, Request
+from ..studies.naming import joined_names
 from ..studies.reality.identifying import identify_robot
 from ..studies.reality.page import UNITS
 from ..studies.reality.replaying import label_of, replay
 from ..studies.reality.request import IdentifyRequest, ReplayRequest
+from ..studies.reality.scoring import score_sets
+from .compare import print_comparison
 from .console import Terminal, make_table, print_json
+from .errors import UserError
+from .evaluate import shower
 from .progress import ProgressDisplay
-from .studies import own_folder
+from .studies import own_folder, resumable
 
 
 def run_replay(request: ReplayRequest, *, out: Path | None, json_output: bool) -> None:
@@ -28,6 +34,31 @@ def run_identify(request: IdentifyRequest, *, out: Path | None, json_output: boo
     _make("identify", identify_robot, print_identified, request, folder, json_output)
     if not json_output:
         Terminal().say(f"set      {folder / request.name}.toml")
+
+
+def run_measured(
+    policy: str, choices: EvaluationOptions, sets: Sequence[str], *, out: Path | None, json_output: bool
+) -> None:
+    """Evaluate under each set, print differences, where the files are, and which constants training never saw."""
+    if choices.parameters is not None:
+        raise UserError("--parameters is not for this command; name the parameter sets behind the policy")
+    request = Request(policy=policy, **vars(choices))
+    with resumable(Terminal(stderr=True), "gauging") as display:
+        found, paths = score_sets(
+            request,
+            sets,
+            folder=out or Path("results") / f"measured-{joined_names([policy])}",
+            runs=out or Path("results"),
+            command=["gaitgauge", *sys.argv[1:]],
+            watch=shower(display),
+        )
+    if json_output:
+        print_json(found)
+        return
+    output = Terminal()
+    print_comparison(output, found)
+    for kind, path in paths.items():
+        output.say(f"{kind:5}{path}")
 
 
 def _make(

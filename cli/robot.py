@@ -62,6 +62,38 @@ def new_robot(model: Path, *, out: Path | None, name: str | None, force: bool) -
     console.say(f"next:\n  {shell_command(['robot', 'check', str(description)])}")
 
 
+def convert_motor(
+    file: Path, *, robot: str, out: Path, error: str | None, activation: str | None, name: str, passive: bool
+) -> None:
+    """Write an actuator network as ``NAME.npz`` and a parameter set that uses it as ``NAME.toml``.
+
+    Raises:
+        MotorNetworkError, PolicyError: the file cannot be used.
+        RobotError: no such robot.
+    """
+    from ..policy.foreign.motor_files import Description, read_motor_file
+    from ..robots.motor_network import save_motor_network
+    from ..robots.sets import find_set, network_text
+
+    if not name.isidentifier():
+        raise UserError(f"--name is '{name}'; use letters, digits and _")
+    if error not in (None, *(signs := {"target-position": 1, "position-target": -1})):
+        raise UserError(f"--error is '{error}'; it must be target-position or position-target")
+    described = None
+    if error is not None:
+        described = Description(error_sign=signs[error], activation=activation or "softsign")  # type: ignore[arg-type]
+    machine = load_robot(robot)
+    network = read_motor_file(file, described)
+    make_folder(out, RobotError)
+    save_motor_network(network, out / f"{name}.npz")
+    text = network_text(machine, name, find_set(machine, None)[1], network, passive=passive)
+    write_atomically(out / f"{name}.toml", text, RobotError)
+    console = Terminal()
+    inputs = f"{network.history} call{'s' if network.history > 1 else ''} of error and velocity"
+    console.say(f"wrote {out / name}.npz: {network.kind}, {inputs}, called every {1e3 * network.period:g} ms")
+    console.say(f"wrote {out / name}.toml: use it with --parameters {out / name}.toml --suite gaitgauge-1-network")
+
+
 def _restore(path: Path, earlier: bytes | None) -> None:
     if earlier is None:
         path.unlink(missing_ok=True)

@@ -77,6 +77,10 @@ _CLUSTER = (
 _THREADS = "CPU threads; results do not depend on them. Default: all cores."
 _CONTRACT = "How a policy without a contract of its own is run: contract.toml, deploy.yaml, config.yaml, env.yaml …"
 _ROBOT = "Robot name, or a robot.toml. Default: the robot that the policy is for."
+_SET = (
+    "Parameter set of the robot, or FILE.toml of 'gaitgauge identify' or 'robot motor', in place of the suite's; a measured "
+    "delay replaces the suite's latency."
+)
 _DEVICE = "cpu or cuda; the default is what the engine is made for."
 PolicyName = Annotated[str, Choice(_ONE, None, "policies", "POLICY")]
 PolicyNames = Annotated[tuple[str, ...], Choice(_MORE, None, "policies", "POLICY...")]
@@ -88,6 +92,7 @@ SuiteName = Annotated[
 EngineName = Annotated[str, Choice("Physics engine, see 'gaitgauge list backends'.", PLACE, "backends")]
 DeviceName = Annotated[str | None, Choice(_DEVICE, PLACE, ("cpu", "cuda"))]
 RobotName = Annotated[str | None, Choice(_ROBOT, PLAYED, "robots")]
+ParameterSet = Annotated[str | None, Choice(_SET, PLAYED)]
 TerrainNames = Annotated[tuple[str, ...], Choice("Terrain; repeatable. Default: the suite's.", PLAYED, "terrains")]
 FirstSeed = Annotated[int, Ge(0), Le(LARGEST_SEED), Choice("Seed of the first robot; the others' follow it.", PLAYED)]
 ThreadCount = Annotated[int | None, Ge(1), Le(MOST_THREADS), Choice(_THREADS, PLACE)]

@@ -34,6 +34,7 @@ from .described import describe
 from .episodes import QUALITY
 from .fit import check_fit
 from .goals import TARGET, check_terrain, count_sub_commands
+from .motors import parameters_digest, suite_parameters, with_parameters
 from .pipelines import PIPELINES, Environment, check_friction, check_payload, make_environments
 from .plan import Plan, PlanRules, environment_result, plan
 from .play.cluster import Cluster, ClusterError, ClusterWorkers, check_address
@@ -131,6 +132,7 @@ def prepare(request: Request) -> Prepared:
     policy = load_policy(request.policy, asked, trust=request.trust, contract_file=request.contract)
     robot = robot_for(policy.contract, request.robot)
     suite = suited(suite, policy.contract)
+    robot = with_parameters(suite, robot, request.parameters)
     check_fit(suite, robot, policy.contract)
     return Prepared(
         request=request,
@@ -184,7 +186,15 @@ def identity(prepared: Prepared) -> dict[str, Any]:
         "level": request.level,
         "environments": [e.key for e in prepared.environments],
         "noise": "by segment",  # runs begun before episodes fell into segments drew theirs otherwise
+        **_parameters(prepared),
     }
+
+
+def _parameters(prepared: Prepared) -> dict[str, str]:
+    """Return the digest of a parameter set that was asked for; nothing where the suite's own is played."""
+    if prepared.request.parameters is None:
+        return {}
+    return {"parameters": parameters_digest(suite_parameters(prepared.suite, prepared.robot))}
 
 
 def common_identity(suite: Suite, policy: str, robot: Robot, device: str, seeds: Sequence[int]) -> dict[str, Any]:
@@ -242,7 +252,7 @@ def evaluate(
         scores = fold(suite, outcomes, (*suite.metrics.weights, QUALITY), evaluated=rules.quality)
         engine = find_backend(request.backend, prepared.device)
         digests = {"policy": prepared.policy.digest, "robot": robot_digest(prepared.robot)}
-        digests |= {"suite": suite.digest, "source": source_digest()}
+        digests |= {"suite": suite.digest, "source": source_digest()} | _parameters(prepared)
         result = Result(
             **vars(scores),
             **vars(

@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
+from pathlib import Path
 
+from ..files.parsing import one_line
+from ..files.provenance import digest
+from ..files.writing import json_text
 from ..policy.contract import PolicyContract, check_robot
 from ..robots import Robot, RobotError
 from ..robots.base import JointParameters
+from ..robots.sets import find_set
 from .suite import Family, Suite
 
 
@@ -22,8 +27,30 @@ def suite_parameters(suite: Suite, robot: Robot) -> JointParameters:
     return found
 
 
+def with_parameters(suite: Suite, robot: Robot, asked: str | None) -> Robot:
+    """Return the robot with another parameter set in place of the one that a suite names; ``asked`` as for ``find_set``, or None.
+
+    Raises:
+        RobotError: no such set, or a wrong one.
+    """
+    if asked is None:
+        return robot
+    return replace(robot, parameters={**robot.parameters, suite.parameters: find_set(robot, asked)[1]})
+
+
+def parameters_digest(constants: JointParameters) -> str:
+    """Return the SHA-256, hexadecimal, of a set and of its network's file; ``RobotError``: the file cannot be read."""
+    files = [] if constants.network is None else [Path(constants.network)]
+    try:
+        return digest(files, json_text({k: v for k, v in asdict(constants).items() if k != "network"}))
+    except OSError as error:
+        raise RobotError(f"'{one_line(error.filename)}' cannot be read: {error.strerror}") from error
+
+
 def joint_parameters(suite: Suite, robot: Robot, contract: PolicyContract) -> JointParameters:
     """Joint and motor constants with which a suite plays a policy: those that it names, with the contract's gains if it says so.
+
+    Of a measured robot the gains are those that act where these are sent.
 
     Raises:
         ContractError: the policy is not for this robot.
@@ -32,14 +59,14 @@ def joint_parameters(suite: Suite, robot: Robot, contract: PolicyContract) -> Jo
     own = suite_parameters(suite, robot)
     if suite.gains == "suite":
         family, joints = family_of(suite, contract), robot.num_joints
-        return (
-            replace(own, stiffness=(family.stiffness,) * joints, damping=(family.damping,) * joints) if family else own
-        )
+        if family is None:
+            return own.commanded(own.stiffness, own.damping)
+        return own.commanded((family.stiffness,) * joints, (family.damping,) * joints)
     stiffness, damping = list(own.stiffness), list(own.damping)
     for policy_joint, robot_joint in enumerate(check_robot(contract, robot)):
         stiffness[robot_joint] = contract.stiffness[policy_joint]
         damping[robot_joint] = contract.damping[policy_joint]
-    return replace(own, stiffness=tuple(stiffness), damping=tuple(damping))
+    return own.commanded(stiffness, damping)
 
 
 _COMMAND_TERMS = ("command", "pose_command")
@@ -54,6 +81,8 @@ def family_of(suite: Suite, contract: PolicyContract) -> Family | None:
 def gains_note(suite: Suite, robot: Robot, contract: PolicyContract) -> str | None:
     """One sentence on gains that are not the ones that a policy was made for, or not the suite's usual ones; None where all agree."""
     usual = suite_parameters(suite, robot)
+    if usual.measured is not None:
+        return f"{'motors by network' if usual.motor == 'network' else 'measured motors'}: {usual.measured}"
     made_for = joint_parameters(replace(suite, gains="contract"), robot, contract)
     own, others = _gains(made_for), _gains(usual)
     if suite.gains == "suite" and (family := family_of(suite, contract)):

@@ -12,6 +12,7 @@ from ..files.choices import (
     ContractName,
     DeviceName,
     EngineName,
+    ParameterSet,
     PolicyName,
     RobotName,
     SuiteName,
@@ -38,6 +39,7 @@ class EvaluationOptions:
     device: DeviceName = None
     robot: RobotName = None
     contract: ContractName = None
+    parameters: ParameterSet = None
     terrains: TerrainNames = ()
     level: Annotated[int | None, Choice("Play at this level (1-10) instead of searching for the highest.", PLAYED)] = (
         None

@@ -8,7 +8,8 @@ from typing import Any
 
 from ..files.parsing import one_line, parse_toml, read_text
 from .base import JointParameters, Robot
-from .loading import RobotError, parameter_set
+from .loading import PER_JOINT, RobotError, parameter_set
+from .motor_network import MotorNetwork
 
 
 def joint_groups(robot: Robot) -> dict[str, list[int]]:
@@ -79,6 +80,21 @@ def set_text(robot: Robot, name: str, values: Mapping[str, Any], provenance: str
         else:
             lines.append(f"{key} = [{', '.join(texts)}]")
     return "\n".join([*lines, f'measured = "{_quoted(provenance)}"', ""])
+
+
+def network_text(robot: Robot, name: str, base: JointParameters, network: MotorNetwork, *, passive: bool) -> str:
+    """Return a set with motors by the network ``NAME.npz`` as TOML text.
+
+    Args:
+        base: its gains, which say what the motors were commanded with, and its limits stay.
+        passive: True keeps rotor inertia and friction too; False leaves them out, because a network of measured torques holds
+            friction already and its training had none.
+    """
+    values = {key: value for key in PER_JOINT if (value := getattr(base, key)) is not None}
+    if not passive:
+        values |= dict.fromkeys(("armature", "joint_damping", "friction_loss"), (0.0,) * robot.num_joints)
+    text = set_text(robot, name, values, network.source)
+    return f'{text}motor = "network"\nnetwork = "{name}.npz"\n'
 
 
 def _digits(value: float) -> str:

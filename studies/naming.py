@@ -77,6 +77,10 @@ def joined_names(policies: Sequence[str]) -> str:
     return whole if len(whole) <= _LONGEST_FOLDER else f"{'-'.join(names[:3])[:_LONGEST_FOLDER]}-of-{len(names)}"
 
 
-def run_folders(policies: Sequence[str], root: Path, *, suite: str, pipeline: str) -> list[Path]:
+def run_folders(
+    policies: Sequence[str], root: Path, *, suite: str, pipeline: str, parameters: str | None = None
+) -> list[Path]:
     """Where the evaluation of each of some policies goes unless the user says so."""
-    return [root / f"{folder_name(name)}-{bare_name(suite)}-{pipeline}" for name in distinct_names(policies)]
+    sets = [] if parameters is None else [bare_name(Path(parameters).name)]
+    end = "-".join([bare_name(suite), *sets, pipeline])
+    return [root / f"{folder_name(name)}-{end}" for name in distinct_names(policies)]

@@ -7,11 +7,16 @@ from typing import Annotated
 
 import typer
 
+from ...files.choices import WRITTEN, Choice, PolicyName
+from ...gauge.request import EvaluationOptions
 from ...studies.reality.request import IdentifyRequest, ReplayRequest
 from ..requests import Tables, output
 from ..running import command
 
 app = typer.Typer()
+
+_SETS = "Two or more parameter sets or their files; differences are to the first."
+_MEASURED = "Folder of the comparison and its evaluations. Default: results/measured-<policy>, and results/."
 
 
 @command(app)
@@ -46,3 +51,22 @@ def identify(
     from ..reality import run_identify
 
     run_identify(request, out=out, json_output=json_output)
+
+
+@command(app)
+def measured(
+    policy: PolicyName,
+    choices: EvaluationOptions,
+    sets: Annotated[tuple[str, ...], Choice(_SETS, None, metavar="SET...", argument=True)] = (),
+    out: Annotated[Path | None, Choice(_MEASURED, WRITTEN)] = None,
+    json_output: Tables = False,
+) -> None:
+    """Evaluate a policy under several parameter sets of its robot, side by side: what the measured robot does to the score.
+
+    Examples:
+      gaitgauge measured pretrained gauge identified --suite demo
+      gaitgauge measured walk.onnx gauge identified.toml network.toml --suite gaitgauge-1-network
+    """
+    from ..reality import run_measured
+
+    run_measured(policy, choices, sets, out=out, json_output=json_output)

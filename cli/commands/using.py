@@ -19,6 +19,8 @@ LISTS = ("robots", "terrains", "backends", "suites", "scenarios", "policies", "p
 """Kinds of names that can be listed."""
 _ARCHITECTURES = "GPU architecture, such as sm_90 (H100, H200); repeatable. Default: this machine's GPU."
 _ENGINES = Choice("mujoco-warp or newton; repeatable. Default: mujoco-warp.", values=("mujoco-warp", "newton"))
+_ERROR = "Which difference its first input is. Default: known for the two public networks."
+ACTIVATIONS = ("softsign", "tanh", "relu", "elu", "identity")
 _CHECKED = Choice("A robot.toml, its folder, or a robot's name.", values="robots", metavar="PATH")
 
 
@@ -99,6 +101,29 @@ def check(
 
     if not check_robot_files(robot, picture=picture, draw=not no_picture, json_output=json_output):
         raise typer.Exit(1)
+
+
+@command(robot)
+def motor(
+    file: Annotated[Path, Choice("Actuator network, a TorchScript file.", metavar="FILE.pt")],
+    robot: Annotated[str, Choice("Robot that has these motors.", values="robots", metavar="ROBOT")],
+    out: Annotated[Path, Choice("Folder of the two files.")] = Path(),
+    name: Annotated[str, Choice("Name of the parameter set and of its files.")] = "network",
+    error: Annotated[str | None, Choice(_ERROR, values=("target-position", "position-target"))] = None,
+    activation: Annotated[
+        str | None, Choice("Between its linear layers. Default: softsign.", values=ACTIVATIONS)
+    ] = None,
+    passive: Annotated[bool, Choice("Keep the robot's rotor inertia and friction beside the network.")] = False,
+) -> None:
+    """Make a parameter set of an actuator network: motors that were learned on a real robot.
+
+    Examples:
+      gaitgauge robot motor anydrive_v3_lstm.pt anymal_c --out motors
+      gaitgauge robot motor mine.pt go2 --error target-position --activation elu
+    """
+    from ..robot import convert_motor
+
+    convert_motor(file, robot=robot, out=out, error=error, activation=activation, name=name, passive=passive)
 
 
 app.add_typer(contract, name="contract")

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import torch
 
-from ...backends.base import BackendError, PhysicsBackend, ResetState, unsupported
+from ...backends.base import BackendError, PhysicsBackend, ResetState, Scene, unsupported
 from ...policy.base import Policy
 from ...policy.batch_invariance import steady_session
 from ...policy.observation import ObservationBuilder
@@ -57,6 +57,24 @@ class Motion(NamedTuple):
     plan: SamplePlan
 
 
+def fixed_delay(scene: Scene, count: int, device: torch.device) -> torch.Tensor | None:
+    """Return the substeps for which a measured robot's targets wait, (K,), in place of a drawn latency; None where not measured.
+
+    Raises:
+        BackendError: a delay is longer than a control period.
+    """
+    delay, physics = scene.parameters.delay, scene.physics
+    if delay is None:
+        return None
+    substeps = round(delay / physics.timestep)
+    if substeps > physics.substeps:
+        longest = f"{1e3 * physics.control_period:g} ms"
+        raise BackendError(
+            f"the parameter set has a delay of {1e3 * delay:.1f} ms; a control period, {longest}, is the most"
+        )
+    return torch.full((count,), substeps, dtype=torch.int64, device=device)
+
+
 class ControlStep(ABC):
     """Take control steps of all worlds of a rollout: observe, act, step, judge. The tensors of a step go from function to function."""
 
@@ -70,6 +88,7 @@ class ControlStep(ABC):
         self.suite, self.backend = suite, backend
         scene, count, device, dtype = backend.scene, backend.num_worlds, backend.device, backend.dtype
         self.substeps = scene.physics.substeps
+        self._delay = fixed_delay(scene, count, device)
         if device.type == "cpu":
             self.session, self.few_rows_suffice = steady_session(policy, count)
         else:
@@ -158,7 +177,8 @@ class ControlStep(ABC):
         """Let the engine take the step in the active worlds."""
         if motion.force is not None:
             self.backend.apply_force(motion.force)
-        self.backend.step(motion.targets, delay=seen.delay, sample_at=motion.plan.at, worlds=self.buffers.active)
+        delay = seen.delay if self._delay is None else self._delay
+        self.backend.step(motion.targets, delay=delay, sample_at=motion.plan.at, worlds=self.buffers.active)
 
 
 class CpuStep(ControlStep):

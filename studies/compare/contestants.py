@@ -56,7 +56,8 @@ def compare_all(
     prepared_requests = {c: prepare(wanted) for c, wanted in requests.items()}
     check_different([found.get(c) or find_policy(c).resolve() for c in contestants], contestants)
     check_alike([found.get(c) or _known_before(prepared_requests[c]) for c in contestants], contestants)
-    folders = run_folders(list(requests), runs, suite=request.suite, pipeline=request.pipeline)
+    names: Any = {"suite": request.suite, "pipeline": request.pipeline, "parameters": request.parameters}
+    folders = run_folders(list(requests), runs, **names)
     for prepared, target in zip(prepared_requests.values(), folders, strict=True):
         check_folder(target, identity(prepared), resume=True)
     labelled = {

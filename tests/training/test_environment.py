@@ -420,7 +420,8 @@ def test_joint_constants_can_be_overridden():
     assert parameters.armature == (0.02,) * 12 and parameters.friction_loss == (0.0,) * 12
     assert parameters.stiffness == (20.0,) * 12
     with pytest.raises(
-        ValueError, match=r"^environment.joints.parameters is 'nope', but robot 'go2' has: gauge, training"
+        ValueError,
+        match=r"^environment.joints.parameters is 'nope', but robot 'go2' has no parameter set 'nope'; it has gauge, training",
     ):
         make(joints=JointConfiguration(parameters="nope"))
 

@@ -2,15 +2,45 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import ClassVar
 
 import torch
 
 from ...backends.base import PhysicsBackend, Randomization
+from ...robots.base import JointParameters
 from .configuration import RandomizationConfiguration, Range
 
 MOTOR_COLUMNS = ("stiffness", "damping", "motor_strength", "motor_speed", "motor_offset")
 """Names of the uniform numbers that a reset takes, one column per joint each."""
+
+
+def outside(ranges: RandomizationConfiguration, measured: JointParameters, joints: Sequence[str]) -> list[str]:
+    """Return a sentence for each constant of a measured set that lies outside of the range that training draws it from.
+
+    Args:
+        joints: names of the joints, in the set's order.
+    """
+    every = range(len(joints))
+    values: dict[str, tuple[Sequence[float] | None, Range]] = {
+        "stiffness": (measured.stiffness_factor, ranges.stiffness),
+        "damping": (measured.damping_factor, ranges.damping),
+        "motor_offset": (measured.target_offset, ranges.motor_offset),
+        "delay": (None if measured.delay is None else [measured.delay] * len(joints), ranges.delay),
+    }
+    sentences = []
+    for name, (found, (low, high)) in values.items():
+        beyond = [j for j in every if found is not None and not low <= found[j] <= high]
+        if found is not None and beyond:
+            worst = max(beyond, key=lambda j: max(low - found[j], found[j] - high))
+            whose = (
+                "all joints"
+                if len(beyond) == len(joints)
+                else ", ".join(joints[j].removesuffix("_joint") for j in beyond)
+            )
+            span = f"{low:g} to {high:g} (environment.randomization.{name})"
+            sentences.append(f"{name} of {whose} was measured outside of {span}, up to {found[worst]:.3g}")
+    return sentences
 
 
 def draw_bodies(
@@ -48,9 +78,14 @@ class MotorParameters:
     """Fields of ``Randomization`` in the order of ``MOTOR_COLUMNS``, for motors without randomization; offsets in rad."""
 
     def __init__(
-        self, ranges: RandomizationConfiguration, num_envs: int, num_joints: int, device: torch.device | str
+        self,
+        ranges: RandomizationConfiguration,
+        num_envs: int,
+        num_joints: int,
+        device: torch.device | str,
+        offset: Sequence[float] | None = None,
     ) -> None:
-        """Prepare motors as the robot's parameter set says."""
+        """Prepare motors as the robot's parameter set says; ``offset`` is the one that a measured set has [rad], (J,)."""
         bounds = [getattr(ranges, name) for name in MOTOR_COLUMNS]
         self._low = torch.tensor([low for low, _ in bounds], device=device)[:, None]
         self._span = torch.tensor([high - low for low, high in bounds], device=device)[:, None]
@@ -58,12 +93,15 @@ class MotorParameters:
         self._varied = [
             name for name, bound in zip(self.NEUTRAL, bounds, strict=True) if set(bound) != {self.NEUTRAL[name]}
         ]
-        self.values = neutral.repeat(num_envs, 1, num_joints)
+        self._shift = torch.zeros(len(self.NEUTRAL), num_joints, device=device)
+        if offset is not None:
+            self._shift[-1] = torch.tensor(offset, device=device)
+        self.values = neutral.repeat(num_envs, 1, num_joints) + self._shift
         """All of them, (N, 5, J)."""
 
     def redraw(self, uniform: torch.Tensor, worlds: torch.Tensor) -> None:
         """Draw new values, in place, for the masked worlds, from uniform numbers (N, 5 J)."""
-        drawn = uniform.view(self.values.shape) * self._span + self._low
+        drawn = uniform.view(self.values.shape) * self._span + self._low + self._shift
         torch.where(worlds[:, None, None], drawn, self.values, out=self.values)
 
     def apply(self, backend: PhysicsBackend) -> None:

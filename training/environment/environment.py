@@ -7,6 +7,7 @@ the state after that, so that the first observation of an episode is fresh. Noth
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -24,12 +25,14 @@ from ...policy.contract import History, ObservationTerm, PolicyContract, standar
 from ...policy.robot_of import REMEMBERED
 from ...robots.base import JointParameters, Robot
 from ...robots.identity import identify
+from ...robots.loading import RobotError
 from ...robots.registry import load_robot
+from ...robots.sets import find_set
 from ..configuration import ConfigurationError
 from .commands import largest_commands
 from .configuration import EnvironmentConfiguration
 from .curriculum import assign_kinds, build_palette
-from .domain_randomization import draw_bodies
+from .domain_randomization import draw_bodies, outside
 from .events import EpisodeStart
 from .height_scan import heading
 from .memory import copied, fitting, restore
@@ -37,6 +40,8 @@ from .observations import Observations
 from .own_terms import policy_observations, resolve_own
 from .step import EnvironmentStep, StepResult
 from .step_inputs import AFTER_RESET, AFTER_STEP, static_inputs
+
+_log = logging.getLogger(__name__)
 
 STATE_VERSION = 1
 
@@ -98,7 +103,7 @@ class TrainingEnvironment(VecEnv):
         level = self._start_levels(configuration)
         scene = Scene(
             robot=self.robot,
-            parameters=parameters,
+            parameters=parameters.commanded(parameters.stiffness, parameters.damping),
             terrains=self.palette.terrains,
             terrain_index=tuple(self.palette.index[kind, level, 0].tolist()),
             physics=configuration.physics,
@@ -385,17 +390,18 @@ class TrainingEnvironment(VecEnv):
 def joint_parameters(robot: Robot, configuration: EnvironmentConfiguration) -> JointParameters:
     """Return the joint constants of the training physics. Raises ConfigurationError: the robot has no such parameter set."""
     settings = configuration.joints
-    if settings.parameters not in robot.parameters:
-        known = ", ".join(robot.parameters)
-        raise ConfigurationError(
-            f"environment.joints.parameters is '{settings.parameters}', but robot '{robot.name}' has: {known}"
-        )
+    try:
+        found = find_set(robot, settings.parameters)[1]
+    except RobotError as error:
+        raise ConfigurationError(f"environment.joints.parameters is '{settings.parameters}', but {error}") from error
+    for sentence in outside(configuration.randomization, found, robot.joint_names):
+        _log.warning("%s", sentence)
     changed: dict[str, Any] = {
         name: (value,) * robot.num_joints
         for name in ("armature", "joint_damping", "friction_loss")
         if (value := getattr(settings, name)) is not None
     }
-    return replace(robot.parameters[settings.parameters], **changed)
+    return replace(found, **changed)
 
 
 def training_contract(

@@ -109,7 +109,9 @@ class EnvironmentStep:
         )
         self.levels = Levels(terrain, palette, kind)
         self.latency = Latency(configuration.randomization, configuration.physics)
-        self.motors = MotorParameters(configuration.randomization, num_envs, joints, device)
+        self.motors = MotorParameters(
+            configuration.randomization, num_envs, joints, device, offset=parameters.target_offset
+        )
         self.starts = EpisodeStarts(configuration.reset, terrain, robot=robot, rasters=rasters, device=device)
         self.pushes = Pushes(configuration.push, num_envs, control_period=period, device=device)
         self.observer = Observer(

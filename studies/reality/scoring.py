@@ -1,0 +1,54 @@
+"""One policy under several parameter sets of its robot, the nominal one first: the same episodes, paired differences."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from ...files.parsing import bare_name
+from ...gauge.evaluate import Request, Status, evaluate, prepare
+from ...gauge.report.page import write_report
+from ..compare.comparison import compare
+from ..compare.report import write_comparison
+from ..naming import run_folders
+from .log import LogError
+
+
+def score_sets(
+    request: Request,
+    sets: Sequence[str],
+    *,
+    folder: Path,
+    runs: Path,
+    command: Sequence[str] = (),
+    watch: Callable[[Status], None] | None = None,
+) -> tuple[dict[str, Any], dict[str, Path]]:
+    """Evaluate a policy under each parameter set and compare; return the comparison as plain data, and its files.
+
+    Args:
+        request: how it is evaluated; its ``parameters`` are replaced by each set.
+        sets: names or files, as for ``find_set``; the first is the one that the others are compared with.
+        folder: of the comparison.
+        runs: folder of the evaluations; what it holds is gone on with.
+        watch: called a few times a second during an evaluation.
+
+    Raises:
+        LogError: fewer than two sets, or two of one name.
+        Those of ``evaluate``: one sentence.
+    """
+    labels = [bare_name(Path(name).name) for name in sets]
+    if len(sets) < 2 or len(set(labels)) < len(labels):
+        given = ", ".join(sets) or "none"
+        raise LogError(
+            f"a policy is compared under two or more different parameter sets, and {given} was given (--parameters)"
+        )
+    prepared = [prepare(replace(request, parameters=name)) for name in sets]
+    results = []
+    for name, one in zip(sets, prepared, strict=True):
+        target = run_folders([request.policy], runs, suite=request.suite, pipeline=request.pipeline, parameters=name)[0]
+        results.append(evaluate(one, target, resume=True, command=command, watch=watch))
+        write_report(target)
+    comparison = compare(results, labels)
+    return comparison.plain(), write_comparison(folder, comparison)
