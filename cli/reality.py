@@ -11,8 +11,9 @@ from ..gauge.request import EvaluationOptions, Request
 from ..studies.naming import joined_names
 from ..studies.reality.identifying import identify_robot
 from ..studies.reality.page import UNITS
+from ..studies.reality.preflight import preflight
 from ..studies.reality.replaying import label_of, replay
-from ..studies.reality.request import IdentifyRequest, ReplayRequest
+from ..studies.reality.request import IdentifyRequest, PreflightRequest, ReplayRequest
 from ..studies.reality.scoring import score_sets
 from .compare import print_comparison
 from .console import Terminal, make_table, print_json
@@ -34,6 +35,26 @@ def run_identify(request: IdentifyRequest, *, out: Path | None, json_output: boo
     _make("identify", identify_robot, print_identified, request, folder, json_output)
     if not json_output:
         Terminal().say(f"set      {folder / request.name}.toml")
+
+
+def run_preflight(request: PreflightRequest, *, out: Path | None, json_output: bool) -> bool:
+    """Check a log against a policy, print a line for each check; return False where one is wrong."""
+    folder = out or Path("results") / f"preflight-{_names([request.log])}"
+    with own_folder(folder):
+        results = preflight(request, folder, command=["gaitgauge", *sys.argv[1:]])
+    if json_output:
+        print_json(results)
+        return bool(results["passed"])
+    console = Terminal()
+    log = results["log"]
+    console.say(f"{log['name']}: {log['defects']}; {log['held'] or 'held in an unknown way'}")
+    table = make_table(f"preflight of {results['policy']} on {results['robot']}", "check", "", "")
+    for finding in results["findings"]:
+        style = {"wrong": "bold red", "not told": "dim"}.get(finding["verdict"])
+        table.add_row(finding["check"], finding["verdict"], finding["sentence"], style=style)
+    console.print(table)
+    console.say(f"results  {folder / 'preflight.json'}")
+    return bool(results["passed"])
 
 
 def run_measured(

@@ -9,7 +9,7 @@ import typer
 
 from ...files.choices import WRITTEN, Choice, PolicyName
 from ...gauge.request import EvaluationOptions
-from ...studies.reality.request import IdentifyRequest, ReplayRequest
+from ...studies.reality.request import IdentifyRequest, PreflightRequest, ReplayRequest
 from ..requests import Tables, output
 from ..running import command
 
@@ -70,3 +70,21 @@ def measured(
     from ..reality import run_measured
 
     run_measured(policy, choices, sets, out=out, json_output=json_output)
+
+
+@command(app)
+def preflight(
+    request: PreflightRequest,
+    out: Annotated[Path | None, output("results/preflight-<log>")] = None,
+    json_output: Tables = False,
+) -> None:
+    """Check a robot's own log against a policy before it walks: joints, signs, gains, delay, offsets, frames; exit code 1 if wrong.
+
+    Examples:
+      gaitgauge preflight pretrained hung.npz
+      gaitgauge preflight walk.onnx run_data.csv --map robot-log.toml --held standing --to 5
+    """
+    from ..reality import run_preflight
+
+    if not run_preflight(request, out=out, json_output=json_output):
+        raise typer.Exit(1)

@@ -95,7 +95,7 @@ def _tensors(data: bytes, source: str) -> list[np.ndarray[Any, Any]]:
 
 def _network(tensors: list[np.ndarray[Any, Any]], description: Description, source: str) -> MotorNetwork:
     """Return a network of scales (1, 1, 2) and (1), LSTM layers in torch's order, and linear layers."""
-    scales = {"error_scale": 1.0, "velocity_scale": 1.0, "torque_scale": 1.0}
+    scales: dict[str, Any] = {"error_scale": 1.0, "velocity_scale": 1.0, "torque_scale": 1.0}
     rest = list(tensors)
     if len(rest) > 1 and rest[0].shape == (1, 1, 2) and rest[1].shape == (1,):
         first, second = rest.pop(0).flatten(), rest.pop(0)

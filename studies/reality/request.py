@@ -8,7 +8,7 @@ from typing import Annotated
 
 from annotated_types import Ge, Le
 
-from ...files.choices import PLACE, PLAYED, Choice, DeviceName, ThreadCount
+from ...files.choices import PLACE, PLAYED, Choice, DeviceName, PolicyName, ThreadCount, Trust
 
 _LOGS = "Logs of a robot (.npz, .csv, .mcap; docs/reference/logs.md)."
 _ROBOT = "Robot name, or a robot.toml. Default: the robot that the log is of."
@@ -60,3 +60,12 @@ class IdentifyRequest(LogOptions):
     draws: Annotated[int, Ge(20), Le(10_000), Choice("Draws of the bootstrap behind the intervals.", PLAYED)] = 200
     seed: Annotated[int, Ge(0), Choice("Seed of the bootstrap.", PLAYED)] = 0
     threads: ThreadCount = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class PreflightRequest(LogOptions):
+    """A policy, and a log of the robot that is to run it."""
+
+    policy: PolicyName
+    log: Annotated[Path, Choice("Log of the robot, hung up or standing.", metavar="LOG")]
+    trust: Trust = False
