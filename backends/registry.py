@@ -5,7 +5,7 @@ A name may carry a variant after a colon (``newton:steel``), which selects the e
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
@@ -213,7 +213,7 @@ def make_backend(name: str, scene: Scene, *, device: str = "cpu", threads: int =
         BackendError: unknown engine, missing package, or a scene that the engine cannot simulate.
     """
     found, plugin = engine_class(name), plugins(GROUP).get(name.partition(":")[0])
-    build = partial(found, scene, device=device, threads=threads)
+    build: Callable[[], PhysicsBackend] = partial(found, scene, device=device, threads=threads)
     if scene.parameters.motor == "network":
         from .network_motors import NetworkMotors
 
