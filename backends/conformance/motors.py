@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -149,6 +150,24 @@ def motor_offset(bench: Bench) -> str:
         worlds.reset()
         worlds.step()
         expect_close("joint_torque of limp motors with offset [N·m]", worlds.read().joint_torque, 0.0, 1e-6)
+    return ""
+
+
+@check("motors/torque", "torque_limits", "motor_strength")
+def torque_motor(bench: Bench) -> str:
+    """A motor that takes torques gives what it is told, limited and then scaled; an engine without such motors is skipped."""
+    parameters = replace(bench.soft(torque_limit=16.0), motor="torque", measured="conformance")
+    strength = np.array([1.0, 0.5, 1.2, 1.0])[:, None].repeat(bench.robot.num_joints, 1)
+    with bench.worlds(parameters, torque_limits=True) as worlds:
+        if not worlds.backend.torque_motors:
+            return "no such motors"
+        worlds.randomize(motor_strength=strength)
+        asked = posed(bench, worlds.count, seed=11)
+        told = np.array([3.0, -7.0, 10.0, 40.0])[:, None].repeat(bench.robot.num_joints, 1)
+        worlds.reset(**asked)
+        worlds.step(told, substeps=1)
+        wanted = told.clip(-16.0, 16.0) * strength
+        expect_close("joint_torque of torque motors [N·m]", worlds.read().joint_torque, wanted, 2e-3)
     return ""
 
 
