@@ -12,6 +12,7 @@
 #include <fstream>
 #include <iostream>
 #include <map>
+#include <memory>
 #include <sstream>
 #include <stdexcept>
 #include <string>
@@ -69,6 +70,7 @@ class Controller {
       terms_.push_back(term);
     }
     action_.assign(pose_.size(), 0.0f);
+    period_ = settings["step_dt"].as<double>();
   }
 
   // The network's output for one step, in the policy's order.
@@ -91,6 +93,9 @@ class Controller {
 
   // Replaces the last output, so that a step starts from the recorded one and rounding does not grow from step to step.
   void set_last_action(const Measured& action) { action_.assign(action.begin(), action.end()); }
+
+  // Time between two steps [s].
+  double period() const { return period_; }
 
   // Joint targets [rad] of the last output, in the SDK's order.
   Values targets() const {
@@ -120,6 +125,7 @@ class Controller {
   Values pose_, action_scale_, offset_, action_;
   std::vector<Values> clip_;
   std::vector<Term> terms_;
+  double period_ = 0.0;
 };
 
 // Reads what record.py wrote: a line of column names, then one line for each step.
@@ -144,6 +150,37 @@ std::vector<Recorded> read(const std::string& path) {
   return steps;
 }
 
+// Writes a line for each step, motors in the SDK's order: a log for 'gaitgauge preflight' and 'gaitgauge replay'.
+class Log {
+ public:
+  explicit Log(const std::string& path) : file_(path) {
+    if (!file_) throw std::runtime_error("'" + path + "' cannot be written");
+  }
+
+  void add(double time, const Values& target, const Recorded& state) {
+    if (file_.tellp() == std::streampos(0)) {
+      file_ << "time";
+      for (const char* name : {"q_des_", "q_", "dq_"})
+        for (std::size_t i = 0; i < target.size(); ++i) file_ << "," << name << i;
+      file_ << ",ang_vel_0,ang_vel_1,ang_vel_2\n";
+    }
+    file_ << time;
+    write(target);
+    write(state.position);
+    write(state.velocity);
+    write(state.angular_velocity);
+    file_ << "\n";
+  }
+
+ private:
+  template <typename Numbers>
+  void write(const Numbers& numbers) {
+    for (const auto number : numbers) file_ << "," << number;
+  }
+
+  std::ofstream file_;
+};
+
 double difference(const Values& a, const Measured& b) {
   if (a.size() != b.size()) throw std::runtime_error("the recording is of another robot");
   double most = 0.0;
@@ -155,16 +192,21 @@ double difference(const Values& a, const Measured& b) {
 }
 
 int main(int count, char** words) {
-  if (count != 3) {
-    std::cerr << "usage: controller FOLDER STATES.csv, with the folder of 'gaitgauge export --layout unitree'\n";
+  if (count != 3 && count != 4) {
+    std::cerr << "usage: controller FOLDER STATES.csv [LOG.csv], with the folder of 'gaitgauge export --layout unitree'\n";
     return 2;
   }
   try {
     Controller controller(words[1]);
     double actions = 0.0, targets = 0.0;
     const std::vector<Recorded> steps = read(words[2]);
+    std::unique_ptr<Log> log;
+    if (count == 4) log = std::make_unique<Log>(words[3]);
+    double time = 0.0;
     for (const Recorded& step : steps) {
       actions = std::max(difference(controller.act(step), step.action), actions);
+      if (log) log->add(time, controller.targets(), step);
+      time += controller.period();
       targets = std::max(difference(controller.targets(), step.target), targets);
       controller.set_last_action(step.action);
     }

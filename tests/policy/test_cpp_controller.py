@@ -15,6 +15,7 @@ import pytest
 from gaitgauge.policy.export.files import export_unitree
 from gaitgauge.policy.loading import load_policy
 from gaitgauge.robots import load_robot
+from gaitgauge.studies.reality.readers import LogMap, read_log
 
 ROOT = Path(gaitgauge.__path__[0])
 EXAMPLE = ROOT / "examples" / "cpp_controller"
@@ -99,3 +100,12 @@ def test_it_says_what_is_missing(controller, tmp_path):
     done = run(controller, tmp_path, tmp_path / "states.csv")
     assert done.returncode == 2
     assert done.stderr.startswith("controller: ")
+
+
+def test_it_writes_a_log_that_preflight_reads(controller, bundle, tmp_path):
+    done = run(controller, bundle, bundle / "states.csv", tmp_path / "log.csv")
+    assert done.returncode == 0, done.stdout + done.stderr
+    mapping = LogMap(joints=load_robot("go2").sdk_joint_names, stiffness=20.0, damping=0.5, held="walking")
+    log = read_log(tmp_path / "log.csv", robot="go2", mapping=mapping)
+    assert log.time[-1] == pytest.approx(199 * 0.02) and log.period == pytest.approx(0.02)
+    assert log.velocity is not None and log.angular_velocity is not None and log.torque is None
