@@ -185,6 +185,7 @@ def _pair(pair: Mapping[str, Any]) -> dict[str, Any]:
             n: {**m, "strip": interval_charts.strip(m["difference"], metric_scale)} for n, m in metrics.items()
         },
         "metric_scale": interval_charts.strip_scale(metric_scale),
+        "commands": pair["commands"],
         "matrix": {
             name: {m: row["difference"] for m, row in place["metrics"].items()}
             for name, place in pair["terrains"].items()
