@@ -72,11 +72,12 @@ def test_what_was_not_made_alike_is_refused_before_anything_is_played(run, refus
         ({"backend": "newton"}, "different engines do not compare: 'first' has newton"),
         ({"robot": "a1"}, "different robots do not compare: 'first' has a1"),
         (
-            {"provenance": {"digests": {"robot": "ab" * 32}}},
+            {"digests": {"robot": "ab" * 32}},
             "name the robot go2, but its files differ (abababababab and ",
         ),
     ):
         card = json.loads((tmp_path / "first" / "results.json").read_text())
+        card["provenance"]["digests"] |= change.pop("digests", {})
         (tmp_path / "card.json").write_text(json.dumps(card | change))
         assert words in refused("compare", "card.json", *alike[2:]).replace("card.json", "first")
     # two policies, and nothing that was played before

@@ -69,7 +69,7 @@ def test_results_and_their_reproducibility(run, refused, tmp_path, policy, tiny)
     assert set(results["terrains"]) == {"flat", "slope_fd"}
     assert len(results["environments"]) == 4
     assert 0.0 <= results["score"] <= 1.0
-    assert len(results["metrics"]) == 8
+    assert len(results["metrics"]) == 9
     assert results["policy"]["contract_hash"]
     assert results["provenance"]["versions"]["mujoco"]
     assert "<html" in (tmp_path / "first" / "report.html").read_text()

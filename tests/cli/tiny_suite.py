@@ -3,6 +3,7 @@
 SUITE = """
 extends = "gaitgauge-1"
 name = "tiny"
+version = "1.0.0"
 title = "a few seconds"
 goals = [{ name = "max_velocity", phases = [0.1, 0.06] }, { name = "target_pos_velocity", phases = [] }]
 
