@@ -58,9 +58,16 @@ Count = Annotated[int, Field(ge=1, lt=2**53)]
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
 
 
+class _Short(reprlib.Repr):
+    """A short form of values; Python refuses to write very long integers."""
+
+    def repr_int(self, x: int, level: int) -> str:
+        return super().repr_int(x, level) if x.bit_length() < 2**10 else f"a number of {x.bit_length()} bits"
+
+
 def shown(value: object) -> str:
     """Return a value as a sentence shows it: shortened, control characters escaped."""
-    short = reprlib.Repr()
+    short = _Short()
     short.maxstring = short.maxother = short.maxlong = _SHOWN
     text = " ".join(short.repr(value).splitlines())
     return text if len(text) <= _SHOWN else text[: _SHOWN - 1] + "…"
@@ -165,11 +172,24 @@ def parse_yaml(text: str, source: str, error: type[Exception]) -> Any:
 
     Tagged tuples and slices of Python are read as the lists that follow their tags.
     """
+    if _DEEP_YAML.search(text):  # each takes the parser longer than the one before
+        raise error(f"{source} is not valid YAML: it is nested too deep")
     try:
         data = yaml.load(text, _Loader)
-    except (yaml.YAMLError, ValueError, OverflowError, AttributeError, TypeError, RecursionError) as problem:
+    except (
+        yaml.YAMLError,
+        ValueError,
+        ArithmeticError,
+        LookupError,
+        AttributeError,
+        TypeError,
+        RecursionError,
+    ) as problem:
         raise error(f"{source} is not valid YAML: {_reason(problem)}") from problem
     return plain(data, source, error)
+
+
+_DEEP_YAML = re.compile(r"(?:[\[{]\s*+){64}")
 
 
 class _Loader(yaml.SafeLoader):
@@ -191,6 +211,8 @@ for _tag in ("tuple", "object/apply:builtins.slice"):
 
 
 def _reason(problem: BaseException) -> str:
+    if isinstance(problem, LookupError | AttributeError | TypeError):  # of a YAML tag's constructor
+        return "a value does not fit its tag"
     return "it is nested too deep" if isinstance(problem, RecursionError) else one_line(problem)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -84,6 +85,29 @@ class Policy(ABC):
     def rowwise_session(self, num_episodes: int) -> PolicySession:
         """Start work on ``num_episodes`` episodes on the CPU, each of which goes through the network alone."""
         return RowwiseSession(self.session, num_episodes)
+
+
+LONGEST_ACTION = 0.1
+"""Computing time that a program may take for one action of one robot [s]: five control periods of most policies."""
+
+
+def timed_action(session: PolicySession, width: int, source: str) -> torch.Tensor:
+    """Return the action (1, J) on zeros of a session of one robot, observations ``width`` wide.
+
+    Raises:
+        PolicyError: it takes more than ``LONGEST_ACTION``, at the second time too: the first may compile.
+    """
+    for last in (False, True):
+        began = time.process_time()
+        action = session.act(torch.zeros(1, width))
+        if (took := time.process_time() - began) <= LONGEST_ACTION:
+            break
+        if last:
+            raise PolicyError(
+                f"'{source}' computes {took:.1f} s for one action of one robot; a policy may take {LONGEST_ACTION:g} s"
+            )
+        session.reset()
+    return action
 
 
 PROBE_EPISODES, _PROBE_STEPS = 3, 8

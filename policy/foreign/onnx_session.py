@@ -30,6 +30,7 @@ from ..base import (
     act_alike,
     check_observation,
     checked_action,
+    timed_action,
 )
 from ..native import first_line
 from .fence.graph import action_output
@@ -218,7 +219,7 @@ class GraphProgram:
                 )
         self.contract = contract
         self._rows = self._runner(self._data, flat=any(len(i.shape) == 1 for i in self._inputs))
-        action = OnnxSession(self._rows, 1).act(torch.zeros(1, contract.observation_width))
+        action = timed_action(OnnxSession(self._rows, 1), contract.observation_width, self.source)
         self.contract = self._rows.contract = replace(contract, num_joints=action.shape[1])
         self._batch = self._proved_batch()
 

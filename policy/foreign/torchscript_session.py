@@ -11,7 +11,7 @@ from __future__ import annotations
 import copy
 import io
 import warnings
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
@@ -27,9 +27,10 @@ from ..base import (
     act_alike,
     check_observation,
     checked_action,
+    timed_action,
 )
 from ..native import LOAD_ERRORS, said_lines
-from .fence.operators import OPERATORS
+from .fence.operators import OPERATORS, RECURRENT
 from .fence.script import RESET_METHODS
 
 MOST_WIDTHS_TRIED = 20
@@ -106,8 +107,22 @@ def load_module(data: bytes, *, source: str) -> Any:
 
 def _check_operators(module: Any, *, source: str) -> None:
     """Check all operators once more, as torch has read them: nothing then hangs on how Python reads the code."""
+    for node in _nodes(module.modules()):
+        space, _, name = node.kind().partition("::")
+        if name not in OPERATORS.get(space, frozenset()):
+            raise PolicyError(
+                f"'{source}' was not loaded: its code uses {node.kind()}, which is not on the list of tensor operators"
+            )
+    # torch's own layers hold the form for packed sequences too, and nothing calls it
+    for node in _nodes([module]):
+        if node.kind().partition("::")[2] in RECURRENT and "batch_sizes" in node.schema():
+            raise PolicyError(f"'{source}' was not loaded: its code uses {node.kind()} with packed sequences")
+
+
+def _nodes(parts: Iterable[Any]) -> Iterator[Any]:
+    """Yield the nodes of all methods of some modules, with what they call in the place of the calls."""
     graphs = []  # nodes live as long as their graph does
-    for part in module.modules():
+    for part in parts:
         for name in part._c._method_names():
             graph = part._c._get_method(name).graph.copy()
             torch._C._jit_pass_inline(graph)
@@ -115,11 +130,7 @@ def _check_operators(module: Any, *, source: str) -> None:
     pending: list[Any] = list(graphs)
     while pending:
         for node in pending.pop().nodes():
-            space, _, name = node.kind().partition("::")
-            if name not in OPERATORS.get(space, frozenset()):
-                raise PolicyError(
-                    f"'{source}' was not loaded: its code uses {node.kind()}, which is not on the list of tensor operators"
-                )
+            yield node
             pending.extend(node.blocks())
 
 
@@ -239,7 +250,7 @@ class ScriptProgram:
         widths = list(contract.inputs.values())
         self._wiring = Wiring(widths=tuple(widths), order=tuple(order), dtype=_dtype(self._module))
         check = CopiesSession(self._module, 1, contract, self.source, self._wiring)
-        action = check.act(torch.zeros(1, contract.observation_width))
+        action = timed_action(check, contract.observation_width, self.source)
         self.contract = replace(contract, num_joints=action.shape[1])
         self.memories = self._find_memories()
 

@@ -5,12 +5,13 @@ from __future__ import annotations
 import io
 import json
 import tempfile
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 from fuzzing import register
 from gaitgauge.backends.base import PhysicsOptions
-from gaitgauge.files.parsing import parse_json
+from gaitgauge.files.parsing import parse_json, parse_toml, parse_yaml, shown
 from gaitgauge.gauge.episodes import Episode, Record, RecordError
 from gaitgauge.gauge.store import RunFolder
 from gaitgauge.gauge.suite import SUITE_FOLDER, load_suite
@@ -132,6 +133,28 @@ def _request(content: bytes, folder: Path) -> None:
     RunFolder(folder / "run", REQUEST, resume=True)
 
 
+class ScalarError(ValueError):
+    """A scalar that no parser takes; of the project's own, as the errors of its readers are."""
+
+    __module__ = "gaitgauge.files.parsing"
+
+
+def _scalars(content: bytes, folder: Path) -> None:
+    """Every value alone, with a tag and as a key, through each parser of texts."""
+    taken, text = 0, content.decode("utf-8", "surrogateescape").replace("\n", " ")
+    tags = ("", "!!bool ", "!!int ", "!!timestamp ")
+    texts = [(parse_yaml, f"x: {tag}{text}") for tag in tags] + [
+        (parse_yaml, f"{text}: 1"),
+        (parse_toml, f"x = {text}"),
+    ]
+    for parse, line in [*texts, (parse_json, text)]:
+        with suppress(ScalarError):
+            assert shown(parse(line, "it", ScalarError)).isprintable()
+            taken += 1
+    if not taken:
+        raise ScalarError("none takes it")
+
+
 SAMPLES = {
     "samples": np.zeros((3, 2), np.float32),
     "goal_index": np.array([0, 0, 1], np.int16),
@@ -176,4 +199,18 @@ register("episode", _episode, seeds=[_archive()])
 register("episode-head", _head, seeds=[HEAD], json=True)
 register("run-request", _request, seeds=[json.dumps(REQUEST).encode()], json=True)
 register("robot-carried", _carried, seeds=[CARRIED], json=True)
+_DIGITS = (
+    b"0x",
+    b"f" * 5000,
+    b"9" * 5000,
+    b"0b",
+    b"1" * 20_000,
+    b"maybe",
+    b"1:99:99",
+    b"2020-99-99",
+    b"1e999",
+    b".inf",
+    b"!!bool ",
+)
+register("scalars", _scalars, seeds=[b"0x1f", b"true", b"1.5", b"2020-01-02"], words=_DIGITS, text=True)
 register("scenario", _scenario, seeds=SCENARIOS, words=_TOML, text=True)

@@ -178,3 +178,59 @@ def test_an_archive_with_a_call_in_its_data_is_refused(tmp_path):
     records["data.pkl"] = b"cos\nsystem\n(X\x04\0\0\0truetR."
     (tmp_path / "policy.pt").write_bytes(packed(records))
     refused(tmp_path / "policy.pt", r"os\.system")
+
+
+class SlowWithMemory(nn.Module):
+    """A few bytes of numbers that one operator multiplies to 268 MB on its way."""
+
+    def __init__(self):
+        super().__init__()
+        self.layer = nn.Linear(45, 12)
+
+    def forward(self, observation: torch.Tensor) -> torch.Tensor:
+        wide = observation[:, :1].expand(-1, 8192)
+        return self.layer(observation) + torch.einsum("ai,aj,i,j->", wide, wide, wide[0], wide[0]) * 0.0
+
+
+class Packed(nn.Module):
+    """torch believes ``batch_sizes`` and reads beyond the memory of the sequence."""
+
+    def __init__(self):
+        super().__init__()
+        self.layer = nn.Linear(45, 12)
+
+    def forward(self, observation: torch.Tensor) -> torch.Tensor:
+        sizes = torch.ones(1, dtype=torch.int64).expand(6)
+        weights = [torch.ones(12, 4), torch.ones(12, 3), torch.ones(12), torch.ones(12)]
+        states = [torch.zeros(1, 6, 3), torch.zeros(1, 6, 3)]
+        out = torch.lstm(torch.ones(6, 4), sizes, states, weights, True, 1, 0.0, False, False)[0]
+        return self.layer(observation) + out.sum() * 0.0
+
+
+class PackedInSetstate(Packed):
+    @torch.jit.export
+    def __getstate__(self):
+        return 3
+
+    @torch.jit.export
+    def __setstate__(self, state: int):
+        self.training = bool((self.helper() > 0.0).item())
+
+    def helper(self) -> torch.Tensor:
+        sizes = torch.ones(1, dtype=torch.int64).expand(6)
+        weights = [torch.ones(12, 4), torch.ones(12, 3), torch.ones(12), torch.ones(12)]
+        states = [torch.zeros(1, 6, 3), torch.zeros(1, 6, 3)]
+        return torch.lstm(torch.ones(6, 4), sizes, states, weights, True, 1, 0.0, False, False)[0].sum()
+
+
+@pytest.mark.parametrize(
+    ("module", "words"),
+    [
+        (SlowWithMemory, r"computes 0\.\d s for one action of one robot; a policy may take 0\.1 s"),
+        (Packed, "was not loaded: its code uses aten::lstm with packed sequences"),
+        (PackedInSetstate, r"uses lstm\(\) with packed sequences while it is loaded"),
+    ],
+)
+def test_memory_inside_an_operator_and_packed_sequences_are_refused(tmp_path, module, words):
+    (tmp_path / "policy.pt").write_bytes(script(module()))
+    refused(tmp_path / "policy.pt", words)

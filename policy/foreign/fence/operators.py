@@ -49,7 +49,7 @@ scatter_reduce searchsorted select select_scatter size slice slice_scatter softm
 std_mean stride sum sum_to_size svd take take_along_dim tensor_split tensordot tile to topk trace trapezoid trapz tril_indices
 triu_indices type_as unbind unflatten unfold unique_consecutive unique_dim unsafe_chunk unsafe_split vander var var_mean vdot
 view view_as view_as_complex view_as_real vsplit vstack where zeros zeros_like _cast_Float _cast_Double _cast_Int _cast_Long
-_softmax _log_softmax _unique2 _weight_norm _reshape_from_tensor _shape_as_tensor _pack_padded_sequence _pad_packed_sequence
+_softmax _log_softmax _unique2 _weight_norm _reshape_from_tensor _shape_as_tensor
 lift_fresh mT mH matrix_H get_device is_inference is_contiguous is_grad_enabled storage_offset element_size cpu result_type
 can_cast promote_types
 """
@@ -68,6 +68,9 @@ TORCH_OPERATORS = frozenset(
     {*_ELEMENTWISE.split(), *(f"{name}_" for name in _ELEMENTWISE.split()), *_OTHER.split(), *_PLAIN.split()}
 )
 """Operators of torch's own set, ``aten``."""
+
+RECURRENT = frozenset({"gru", "lstm", "rnn_relu", "rnn_tanh"})
+"""Operators with a form for packed sequences, whose ``batch_sizes`` torch believes and reads beyond its memory: that form is refused."""
 
 PRIM_OPERATORS = _names("""
 BroadcastSizes CallFunction CallMethod ChunkSizes Closure Constant ConstantChunk CreateObject DictConstruct Enter EnumName

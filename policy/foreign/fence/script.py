@@ -17,7 +17,7 @@ import torch
 
 from ...base import PolicyError
 from .archive import packed, read_archive
-from .operators import OPERATORS, PYTHON_NAMES, TORCH_OPERATORS
+from .operators import OPERATORS, PYTHON_NAMES, RECURRENT, TORCH_OPERATORS
 from .pickles import REBUILD_QUANTIZED, REBUILD_TENSOR, Call, check_tensors, read_pickle
 
 MOST_CODE = 8 * 2**20
@@ -99,6 +99,7 @@ def _check_code(trees: Mapping[str, ast.Module], source: str) -> None:
         methods.update(node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef))
     # a method of the archive's own by the name of an operator would let that operator through
     operators = {name for name in methods - TORCH_OPERATORS if torch._C._jit_get_schemas_for_operator(f"aten::{name}")}
+    _check_setstate(trees, source)
     for name, tree in trees.items():
         variables = {
             node.id for node in ast.walk(tree) if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)
@@ -190,6 +191,33 @@ _NODES = (
     ast.boolop, ast.operator, ast.unaryop, ast.cmpop,
 )
 # fmt: on
+
+
+def _check_setstate(trees: Mapping[str, ast.Module], source: str) -> None:
+    """Refuse recurrent operators with packed sequences in what ``__setstate__`` may call: it runs before torch's graph is looked at."""
+    functions: dict[str, list[ast.FunctionDef]] = {}
+    for tree in trees.values():
+        for node in ast.walk(tree):
+            if isinstance(node, ast.FunctionDef):
+                functions.setdefault(node.name, []).append(node)
+    seen, pending = {"__setstate__"}, ["__setstate__"]
+    while pending:
+        calls = [n for f in functions.get(pending.pop(), ()) for n in ast.walk(f) if isinstance(n, ast.Call)]
+        for call in calls:
+            name = call.func.attr if isinstance(call.func, ast.Attribute) else getattr(call.func, "id", "")
+            if name in RECURRENT and not _is_plain_recurrent(call):
+                raise PolicyError(
+                    f"'{source}' was not loaded: its code uses {name}() with packed sequences while it is loaded"
+                )
+            if name not in seen:
+                seen.add(name)
+                pending.append(name)
+
+
+def _is_plain_recurrent(call: ast.Call) -> bool:
+    """Return whether a recurrent operator is called with input, state, weights and, as torch writes it, a plain True or False."""
+    has_biases = call.args[3] if len(call.args) > 3 and not call.keywords else None
+    return isinstance(has_biases, ast.Constant) and isinstance(has_biases.value, bool)
 
 
 def _words(node: ast.expr) -> list[str] | None:
