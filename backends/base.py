@@ -57,7 +57,7 @@ class DeviceError(BackendError):
 class PhysicsOptions:
     """Options of the simulation."""
 
-    timestep: Annotated[float, Field(gt=0.0, le=0.1)] = 0.002
+    timestep: Annotated[float, Field(ge=1e-5, le=0.1)] = 0.002
     """Length of one physics step (a substep of the control period) [s]."""
     substeps: Annotated[int, Field(ge=1, le=1000)] = 10
     """Physics steps per control period."""

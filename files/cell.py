@@ -15,6 +15,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -39,22 +40,67 @@ _NETWORK_RIGHTS, _SCOPES = 0b11, 0b11
 
 _OPENING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC
 _CLONE_THREAD = 0x10000
-# Numbers of system calls: first calls with flags to check, then calls that always fail. The latter change files or
-# their names and rights, start programs, open sockets, and reach into other processes or the kernel.
+# Numbers of system calls: first calls with flags to check; calls that may act on this process alone, 0 or by its own number; calls
+# that always fail. The latter change files or their names and rights, start programs, open sockets, reach into other processes or
+# the kernel, and change limits, users, keys, mounts, clocks and modules.
+_SAME_EVERYWHERE = (
+    424,
+    425,
+    426,
+    427,
+    428,
+    429,
+    430,
+    431,
+    432,
+    433,
+    434,
+    437,
+    438,
+    440,
+    442,
+    443,
+    448,
+    452,
+    460,
+    463,
+    466,
+    467,
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Calls:
+    """System calls of one kind of processor."""
+
+    opening: dict[int, int]
+    """Calls that open a file, and the place of their flags."""
+    itself: tuple[int, ...]
+    """Calls whose first argument must be 0 or this process."""
+    refused: tuple[int, ...]
+    clone: int
+
+
 # fmt: off
-_CALLS: dict[str, tuple[dict[int, tuple[int, int]], tuple[int, ...], int]] = {
-    "x86_64": (
-        {2: (1, _OPENING), 257: (2, _OPENING)},
-        (29, 41, 53, 57, 58, 59, 62, 64, 68, 76, 82, 83, 84, 85, 86, 87, 88, 90, 91, 92, 93, 94, 101, 132, 133, 165, 166, 188,
-         189, 190, 197, 198, 199, 200, 235, 240, 250, 258, 259, 260, 261, 263, 264, 265, 266, 268, 272, 280, 298, 304, 308, 310,
-         311, 316, 319, 321, 322, 323, 424, 425, 434, 437, 452),
-        56,
+_CALLS = {
+    "x86_64": _Calls(
+        opening={2: 1, 257: 2},
+        itself=(203, 234, 302),  # sched_setaffinity, tgkill, prlimit64
+        refused=(29, 41, 53, 57, 58, 59, 62, 64, 68, 76, 82, 83, 84, 85, 86, 87, 88, 90, 91, 92, 93, 94, 101, 103, 105, 106, 109, 112,
+         113, 114, 116, 117, 119, 122, 123, 126, 129, 132, 133, 134, 135, 141, 142, 144, 153, 155, 159, 161, 163, 164, 165, 166,
+         167, 168, 169, 170, 171, 172, 173, 175, 176, 179, 188, 189, 190, 197, 198, 199, 200, 212, 227, 235, 240, 241, 246, 248,
+         249, 250, 251, 256, 258, 259, 260, 261, 263, 264, 265, 266, 268, 272, 279, 280, 297, 298, 300, 303, 304, 305, 308, 310,
+         311, 312, 313, 314, 316, 317, 319, 320, 321, 322, 323, *_SAME_EVERYWHERE),
+        clone=56,
     ),
-    "aarch64": (
-        {56: (2, _OPENING)},
-        (5, 6, 7, 14, 15, 16, 33, 34, 35, 36, 37, 38, 39, 40, 45, 52, 53, 54, 55, 88, 97, 117, 129, 130, 180, 186, 190, 194, 198,
-         199, 219, 221, 241, 265, 268, 270, 271, 276, 279, 280, 281, 282, 424, 425, 434, 437, 452),
-        220,
+    "aarch64": _Calls(
+        opening={56: 2},
+        itself=(122, 131, 261),
+        refused=(5, 6, 7, 14, 15, 16, 30, 33, 34, 35, 36, 37, 38, 39, 40, 41, 45, 51, 52, 53, 54, 55, 58, 60, 88, 89, 91, 92, 97,
+         104, 105, 106, 112, 116, 117, 118, 119, 129, 130, 138, 140, 142, 143, 144, 145, 146, 147, 149, 151, 152, 154, 157, 159, 161,
+         162, 170, 171, 180, 181, 186, 190, 194, 198, 199, 217, 218, 219, 221, 224, 225, 238, 239, 240, 241, 262, 264, 265, 266,
+         268, 270, 271, 272, 273, 274, 276, 277, 279, 280, 281, 282, 294, *_SAME_EVERYWHERE),
+        clone=220,
     ),
 }
 # fmt: on
@@ -180,7 +226,7 @@ def _seccomp(libc: ctypes.CDLL) -> bool:
     machine = platform.machine()
     if machine not in _CALLS or sys.maxsize < 2**32:
         return False
-    flagged, refused, clone = _CALLS[machine]
+    calls = _CALLS[machine]
     load, equal, at_least, masked, give = 0x20, 0x15, 0x35, 0x45, 0x06
     kill, deny, absent, allow = 0x80000000, 0x00050000 | 1, 0x00050000 | 38, 0x7FFF0000
     lines: list[tuple[int, int, int, int]] = [
@@ -194,13 +240,16 @@ def _seccomp(libc: ctypes.CDLL) -> bool:
         (equal, 0, 1, _CLONE3),
         (give, 0, 0, absent),
     ]
-    for number in refused:
+    for number in calls.refused:
         lines += [(equal, 0, 1, number), (give, 0, 0, deny)]
-    for number, (argument, flags) in flagged.items():
-        lines += [(equal, 0, 4, number), (load, 0, 0, 16 + 8 * argument), (masked, 0, 1, flags)]
+    for number, argument in calls.opening.items():
+        lines += [(equal, 0, 4, number), (load, 0, 0, 16 + 8 * argument), (masked, 0, 1, _OPENING)]
+        lines += [(give, 0, 0, deny), (give, 0, 0, allow)]
+    for number in calls.itself:
+        lines += [(equal, 0, 5, number), (load, 0, 0, 16), (equal, 2, 0, 0), (equal, 1, 0, os.getpid())]
         lines += [(give, 0, 0, deny), (give, 0, 0, allow)]
     # threads may be started, processes not
-    lines += [(equal, 0, 4, clone), (load, 0, 0, 16), (masked, 1, 0, _CLONE_THREAD), (give, 0, 0, deny)]
+    lines += [(equal, 0, 4, calls.clone), (load, 0, 0, 16), (masked, 1, 0, _CLONE_THREAD), (give, 0, 0, deny)]
     lines += [(give, 0, 0, allow), (give, 0, 0, allow)]
     code = ctypes.create_string_buffer(b"".join(struct.pack("=HBBI", *line) for line in lines))
     program = ctypes.create_string_buffer(struct.pack("HxxxxxxP", len(lines), ctypes.addressof(code)))

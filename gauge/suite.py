@@ -455,6 +455,10 @@ def _check(suite: Suite, source: str) -> None:
             f"matrix.terrains has the unknown terrain {shown(name)}{did_you_mean(name, grounds) or ';'} choose from "
             f"{', '.join(grounds)}"
         ] = name in grounds
+    for name, limits in (("flat", suite.commands.flat), ("levelled", suite.commands.levelled)):
+        rules[
+            f"commands.{name} is {shown(list(limits))}; tracking errors are measured by these limits, so each must be above 0"
+        ] = all(limit > 0.0 for limit in limits)
     rules["metrics.weights are all zero; give at least one metric a weight above 0"] = any(metrics.weights.values())
     for rule, kept in rules.items():
         if not kept:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -27,12 +28,23 @@ def page_template(module: str, name: str, **filters: Callable[..., object]) -> j
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader([Path(file).parent / "templates" for file in (module, __file__)]),
         autoescape=True,
+        finalize=_visible,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
     environment.filters |= {"fixed": fixed} | filters
     return environment.get_template(name)
+
+
+_CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028\u2029\u202a-\u202e\u2066-\u2069]")
+
+
+def _visible(value: object) -> object:
+    """Return a value of a page with control characters of a text, such as those that a terminal obeys, as their escape sequences."""
+    if not isinstance(value, str) or not _CONTROL.search(value):
+        return value
+    return type(value)(_CONTROL.sub(lambda found: found[0].encode("unicode_escape").decode(), value))
 
 
 def page_of(source: Path, name: str, render: Callable[[dict[str, Any]], str], *, command: str) -> Path:

@@ -188,6 +188,14 @@ def test_report_is_written_beside_the_results(tmp_path, stress):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["report.html", "results.json"]
 
 
+def test_a_page_keeps_no_control_character(stress):
+    """A page that is printed in a terminal, as by ``cat``, gives it no commands."""
+    policy = replace(stress.policy, path="a\x1b]0;owned\x07\x9b31m\u202e.pt", provenance={"made\x1b": "by\x1b[2J"})
+    text = render(replace(stress, policy=policy))
+    assert "\\x1b]0;owned\\x07\\x9b31m\\u202e.pt" in text
+    assert not [c for c in text if not c.isprintable() and c not in "\n\xa0\xad\u2009\u202f"]
+
+
 @pytest.mark.parametrize("key", ["environments", "terrains", "provenance", "policy", "health", "score", "metrics"])
 @pytest.mark.parametrize(
     "value", [None, {"a": 1}, *(pytest.param(v, marks=pytest.mark.slow) for v in ([1], "text", -1)), "left out"]

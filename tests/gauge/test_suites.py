@@ -314,3 +314,21 @@ def test_an_unknown_suite_is_refused_with_a_hint(tmp_path):
 def test_an_incomplete_suite_is_refused(suite_file):
     with pytest.raises(SuiteError, match=r"mine.toml: it lacks version, title"):
         load_suite(suite_file('name = "mine"'))
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("[physics]\ntimestep = 1e-12\n", "physics.timestep is 1e-12; it must be greater than or equal to 0.00001"),
+        (
+            "[commands]\nflat = [0.0, 0.0, 0.0]\n",
+            r"commands.flat is \[0.0, 0.0, 0.0\]; tracking errors are measured by",
+        ),
+        ("[commands]\nlevelled = [1.0, 0.0, 1.0]\n", "commands.levelled is .* each must be above 0"),
+    ],
+)
+def test_a_suite_that_never_ends_or_commands_nothing_is_refused(tmp_path, text, sentence):
+    path = tmp_path / "mine.toml"
+    path.write_text(f'extends = "demo"\nname = "mine"\n{text}')
+    with pytest.raises(SuiteError, match=sentence):
+        load_suite(str(path))
