@@ -305,7 +305,7 @@ def test_what_a_suite_cannot_extend_is_named(suite_file, base, sentence):
 
 
 def test_an_unknown_suite_is_refused_with_a_hint(tmp_path):
-    with pytest.raises(SuiteError, match=r"there is no suite 'gaitguage-1'; did you mean 'gaitgauge-1'[?] choose"):
+    with pytest.raises(SuiteError, match=r"there is no suite 'gaitguage-1'; did you mean 'gaitgauge-1'"):
         load_suite("gaitguage-1")
     with pytest.raises(SuiteError, match=r"missing.toml' does not exist"):
         load_suite(str(tmp_path / "missing.toml"))
