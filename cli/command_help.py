@@ -13,7 +13,7 @@ from typer.core import TyperArgument, TyperGroup, TyperOption
 
 COMMAND_GROUPS: Mapping[str, tuple[str, ...]] = {
     "Judge": ("evaluate", "compare", "verify", "board"),
-    "Study": ("jury", "consistency", "validate", "trial", "latent", "sweep"),
+    "Study": ("jury", "consistency", "validate", "trial", "worst", "latent", "sweep"),
     "Real robots": ("replay", "identify", "measured", "preflight"),
     "Learn": ("train",),
     "Use": ("play", "export", "import", "contract"),

@@ -1,4 +1,4 @@
-"""Commands that judge and study: evaluate, compare, verify, board, validate, jury, consistency, trial, latent."""
+"""Commands that judge and study: evaluate, compare, verify, board, validate, jury, consistency, trial, worst, latent."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from ...studies.consistency.request import StudyRequest
 from ...studies.jury.request import JuryRequest
 from ...studies.latent.request import LatentRequest
 from ...studies.trials.request import TrialRequest
+from ...studies.worst.request import WorstRequest
 from ..errors import UserError
 from ..requests import Tables, VerifyRequest, output, resume
 from ..running import command
@@ -22,6 +23,7 @@ app = typer.Typer()
 _CONTESTANTS = "Two or more of: policies, as for evaluate; results folders; results.json files and score cards."
 _ENGINES = "Engines, separated by commas; NAME@option=value changes a physics option (mujoco@timestep=0.005)."
 _JURY = "Engines, separated by commas. Default: one of each family that is installed, and MuJoCo with feet that turn freely."
+_OTHERS = "Engines in which failures are played again, separated by commas. Default: MuJoCo with feet that turn freely, and Drake."
 _COMPARED = "Folder of the comparison and its evaluations. Default: results/compare-<names>, and results/."
 _TABLES = "The measured table, then one for each simulator (CSV; docs/guides/validate.md)."
 _EXAMPLE = Choice("Tables that ship with the project: paper.", values=("paper",), flags=("--example",))
@@ -170,6 +172,26 @@ def trial(
     from ..trial import run_trial
 
     run_trial(request, out=out, json_output=json_output)
+
+
+@command(app)
+def worst(
+    request: WorstRequest,
+    others: Annotated[str | None, Choice(_OTHERS, PLACE, "backends")] = None,
+    films: Annotated[bool, Choice("Film the failures of the gallery, where this machine can draw.", WRITTEN)] = True,
+    out: Annotated[Path | None, output("results/worst-<policy>")] = None,
+    resume: Annotated[bool, resume("search")] = False,
+    json_output: Tables = False,
+) -> None:
+    """Search for what makes a policy fall: pushes, slips, loads, steps … within stated ranges, with a bound on its probability.
+
+    Examples:
+      gaitgauge worst pretrained
+      gaitgauge worst walk.onnx --minutes 60 --threads 32 --others mujoco@foot_condim=3,newton
+    """
+    from ..worst import run_worst
+
+    run_worst(request, others, films=films, out=out, resume=resume, json_output=json_output)
 
 
 @command(app)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
@@ -266,6 +266,23 @@ def load_scenario(name: str) -> Scenario:
             "results are not taken for that one's"
         )
     return scenario
+
+
+def scenario_text(scenario: Scenario) -> str:
+    """Return a scenario as a TOML file from which ``load_scenario`` reads the same one; what stands for nothing is left out."""
+    return "\n".join(_lines(asdict(scenario), "")) + "\n"
+
+
+def _lines(table: Mapping[str, Any], name: str) -> Iterator[str]:
+    """Yield the lines of a table: its own values, then tables and lists of tables in it."""
+    given = {k: v for k, v in table.items() if v is not None and v != ()}
+    parts = {k: v for k, v in given.items() if isinstance(v, dict) or (isinstance(v, tuple) and isinstance(v[0], dict))}
+    yield from (f"{k} = {json.dumps(v)}" for k, v in given.items() if k not in parts)
+    for key, part in parts.items():
+        path = f"{name}{key}"
+        for entry in (part,) if isinstance(part, dict) else part:
+            yield f"\n[{path}]" if isinstance(part, dict) else f"\n[[{path}]]"
+            yield from _lines(entry, f"{path}.")
 
 
 def _problems(scenario: Scenario) -> Iterator[str]:

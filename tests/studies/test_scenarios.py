@@ -1,8 +1,10 @@
 """Scenario files: those that ship, and those that could not be played or decided."""
 
+from dataclasses import replace
+
 import pytest
 from gaitgauge.studies.trials.page import view
-from gaitgauge.studies.trials.scenario import ScenarioError, load_scenario, scenario_names
+from gaitgauge.studies.trials.scenario import Payload, ScenarioError, load_scenario, scenario_names, scenario_text
 from gaitgauge.studies.trials.trialling import profile
 
 COMMAND = "[[commands]]\n"
@@ -64,6 +66,12 @@ def test_fields_that_came_later_leave_digests_as_they_were(tmp_path):
     assert load_scenario("sprint").digest == "d3d2ecf7bcbb565df29ac2afdc3db5b6203e068ab0669d4cf4a5d20302649880"
     own = load(tmp_path, OWN)
     assert load(tmp_path, OWN.replace("friction = 0.6", "friction = 0.6\nlatency = 0.0")).digest != own.digest
+
+
+def test_a_scenario_written_to_a_file_is_the_same_when_it_is_read(tmp_path):
+    for name in scenario_names():
+        scenario = replace(load_scenario(name), name="own", payload=Payload(kilograms=1.5), latency=0.02)
+        assert load(tmp_path, scenario_text(scenario)) == scenario
 
 
 def test_unknown_names_are_refused_with_those_that_are_near():

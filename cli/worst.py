@@ -1,0 +1,88 @@
+"""Print what a search for failures found, and film it (``gaitgauge worst``)."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from ..studies.naming import joined_names
+from ..studies.worst.request import WorstRequest, WorstStatus
+from .console import Terminal, make_table, print_json
+from .errors import UserError
+from .picture import Quality, choose_renderer
+from .policies import policy_files
+from .progress import ProgressDisplay, duration
+from .studies import resumable
+
+_FILMED = 0.15
+"""Share of the budget that is left for films."""
+
+
+def run_worst(
+    request: WorstRequest, others: str | None, *, films: bool, out: Path | None, resume: bool, json_output: bool
+) -> None:
+    """Search, show progress, film the gallery, print the table and where the files are."""
+    folder = out or Path("results") / f"worst-{joined_names([request.policy])}"
+    if others is not None:
+        request = replace(request, others=tuple(name.strip() for name in others.split(",") if name.strip()))
+    request = replace(request, policy=policy_files((request.policy,))[0])
+    console = Terminal(stderr=True)
+    quality = _quality(console) if films else None  # before MuJoCo is imported
+    from ..studies.worst.page import write_page
+    from ..studies.worst.study import prepare_search, search_worst
+
+    prepared = prepare_search(request)  # all that can be wrong with the request is said before anything is written
+    for engine in prepared.skipped:
+        console.say(f"{engine['engine']} does not play failures again: {engine['reason']}")
+    with resumable(console, "searching", folder, "--resume") as display:
+        results = search_worst(
+            prepared,
+            folder,
+            resume=resume,
+            reserve=_FILMED if quality else 0.0,
+            command=["gaitgauge", *sys.argv[1:]],
+            watch=lambda status: _show(display, status),
+        )
+        if quality:
+            from .scenario_films import film_failures
+
+            results = film_failures(prepared, folder, quality, lambda share, text: display.update(share, text))
+    page = write_page(folder)
+    if json_output:
+        print_json(results)
+    else:
+        output = Terminal()
+        print_worst(output, results)
+        output.say(f"results  {folder / 'worst.json'}\npage     {page}")
+
+
+def _quality(console: Terminal) -> Quality | None:
+    try:
+        return choose_renderer()
+    except UserError as error:
+        console.say(f"no films: {error}")
+        return None
+
+
+def _show(display: ProgressDisplay, status: WorstStatus) -> None:
+    left = f"about {duration(status.seconds_left)} left"
+    details = {"plays": str(status.played), "falls": str(status.fallen)}
+    display.update(status.share, f"{status.stage}: {left}", details)
+
+
+def print_worst(console: Terminal, results: Mapping[str, Any]) -> None:
+    """Print the failures of the gallery, and the findings in sentences."""
+    engines = [results["engine"], *(other["engine"] for other in results["others"])]
+    table = make_table("falls under the mildest conditions that differ in cause", "", "conditions", "after", *engines)
+    ranked = [failure for failure in results["failures"] if failure["rank"] is not None]
+    for failure in sorted(ranked, key=lambda f: f["rank"]):
+        shares = [f"{sum(failure['again'][name])}/{len(failure['again'][name])}" for name in engines]
+        words = "; ".join(failure["words"]) or "nothing unusual"
+        table.add_row(str(failure["rank"]), words, f"{failure['seconds']:.1f} s", *shares)
+    if ranked:
+        console.print(table)
+    for sentence in results["sentences"]:
+        console.say(sentence)

@@ -1,0 +1,491 @@
+"""A search from request to ``worst.json``: a random sample, the search, what each failure needs, and every failure again."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import time
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, field
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from ...backends.base import BackendError
+from ...backends.registry import engine_class
+from ...files.choices import cpu_threads
+from ...files.parsing import parse_json, read_text, shown
+from ...files.provenance import provenance
+from ...files.writing import json_text, lock_folder, make_folder, replacing, write_atomically
+from ...gauge.suite import load_suite
+from ...robots import Robot
+from ...robots.loading import robot_digest
+from ..consistency.variants import Variant, parse_variant, place
+from ..policies import Loaded, describe, load_policies
+from ..trials.scenario import Scenario, scenario_text
+from .playing import Play, Players
+from .ranges import PARAMETERS, Case, Measures, Ranges, describe_case, measures_of, scenario_of
+from .request import OTHERS, WorstError, WorstRequest, WorstStatus
+from .search import (
+    CAUSE_APART,
+    CONFIDENCE,
+    VALUES_APART,
+    Archive,
+    Elite,
+    Outcome,
+    Reduction,
+    choose_different,
+    hardness,
+    random_case,
+    upper_bound,
+    waiting,
+)
+
+SCHEMA = 1
+SEEDS = 6
+"""Seeds with which a failure of the gallery is played: its own, 0, and five more."""
+GALLERY = 10
+"""Failures that are filmed."""
+_SAMPLED = 0.35
+"""Share of the budget that the random sample takes."""
+_NEEDED, _SETTLED = 0.5, 0.85
+"""Shares of the budget at which it is no longer asked what the falls of the sample need, and what those of the search need."""
+_REST, _REST_PLAYS = 0.4, 330
+"""Largest share of the budget that is left to what follows the search, and about the plays that it takes."""
+_LEAST_SAMPLE, _MOST_SAMPLE = 30, 10_000
+"""Least and largest number of cases of the random sample; 30 without a fall bound its probability by 10 %."""
+_REDUCED = 12
+"""Falls of the sample whose needless factors are taken away before the search."""
+
+Watch = Callable[[WorstStatus], None]
+
+
+@dataclass(kw_only=True)
+class PreparedSearch:
+    """A request that can be carried out."""
+
+    request: WorstRequest
+    label: str
+    loaded: Loaded
+    engine: Variant
+    others: list[Variant]
+    measures: Measures
+    ranges: Ranges = field(default_factory=Ranges)
+    skipped: list[dict[str, str]] = field(default_factory=list)
+    """Engines that do not play failures again, and why."""
+
+    @property
+    def robot(self) -> Robot:
+        """Return the robot."""
+        return self.loaded.robot
+
+
+def prepare_search(request: WorstRequest) -> PreparedSearch:
+    """Check a request and load what it names.
+
+    Raises:
+        WorstError: the policy cannot be had, or two engines are the same.
+        ConsistencyError, SuiteError, RobotError, ContractError, BackendError: one sentence on what is wrong.
+    """
+    suite = load_suite(request.suite)
+    device = request.device or ("cuda" if torch.cuda.is_available() else "cpu")
+    engine = _placed(request.backend, device)
+    engine.physics(suite.physics)
+    others: dict[str, Variant] = {}
+    skipped = []
+    for text in OTHERS if request.others is None else request.others:
+        variant = parse_variant(text)
+        variant.physics(suite.physics)
+        if variant.label == engine.label:
+            if request.others is not None:
+                raise WorstError(
+                    f"--others names {shown(variant.label)}, the engine that is searched; name another one"
+                )
+            continue
+        try:
+            others[variant.label] = _placed(text, device)
+        except BackendError as error:
+            if request.others is not None:
+                raise
+            skipped.append({"engine": variant.label, "reason": str(error)})
+    loaded, refused = load_policies(
+        [request.policy], request.robot, trust=request.trust, contract_file=request.contract
+    )
+    if refused:
+        raise WorstError(refused[0]["reason"])
+    ((label, found),) = loaded.items()
+    limits = found.policy.contract.command_limits
+    measures = measures_of(found.robot, limits, request.suite, request.seed, suite.parameters)
+    return PreparedSearch(
+        request=request,
+        label=label,
+        loaded=found,
+        engine=engine,
+        others=list(others.values()),
+        measures=measures,
+        skipped=skipped,
+    )
+
+
+def _placed(text: str, device: str) -> Variant:
+    variant = parse_variant(text)
+    return place(variant, None if device == "cuda" else "cpu")
+
+
+def search_worst(
+    request: WorstRequest | PreparedSearch,
+    folder: Path,
+    *,
+    resume: bool = False,
+    reserve: float = 0.0,
+    command: Sequence[str] = (),
+    watch: Watch = lambda _: None,
+) -> dict[str, Any]:
+    """Search for failures; every finished batch is on disk at once.
+
+    Args:
+        reserve: share of the budget that is left to the caller, for films.
+
+    Returns the content of ``worst.json`` (docs/guides/worst.md).
+
+    Raises:
+        WorstError: the folder belongs to another search, or holds this one and ``resume`` is not asked for.
+        ConsistencyError, SuiteError, RobotError, PolicyError, ContractError, BackendError: one sentence.
+    """
+    prepared = request if isinstance(request, PreparedSearch) else prepare_search(request)
+    torch.set_num_threads(1)  # several would change the last bits of the policy's output
+    with ExitStack() as stack:
+        log = stack.enter_context(_Log(folder, _identity(prepared), resume=resume))
+        policy, robot = prepared.loaded.policy, prepared.robot
+        players = stack.enter_context(Players(policy, robot, cpu_threads(prepared.request.threads)))
+        search = _Search(prepared, log, players, (1.0 - reserve) * 60.0 * prepared.request.minutes, watch)
+        found = search.run()
+        results = _results(prepared, search, found, command)
+        (folder / "scenarios").mkdir(exist_ok=True)
+        for failure in results["failures"]:
+            if failure["rank"] is not None:
+                scenario = search.scenario(search.case(failure["name"]))
+                write_atomically(folder / failure["scenario"], scenario_text(scenario), WorstError)
+        write_atomically(folder / "worst.json", json_text(results), WorstError)
+    return results
+
+
+def _identity(prepared: PreparedSearch) -> dict[str, Any]:
+    """Return all that decides about a search but for its length."""
+    return {
+        "policy": prepared.loaded.policy.file_sha256,
+        "contract": prepared.loaded.policy.contract.hash,
+        "robot": robot_digest(prepared.robot),
+        "suite": load_suite(prepared.request.suite).digest,
+        "engine": prepared.engine.label,
+        "device": prepared.engine.device,
+        "seed": prepared.request.seed,
+        "batch": prepared.request.batch,
+        "ranges": asdict(prepared.ranges),
+    }
+
+
+class _Log:
+    """Finished batches on disk, by what was played: who plays the same again reads them."""
+
+    def __init__(self, folder: Path, identity: dict[str, Any], *, resume: bool) -> None:
+        marker, wanted = folder / "search.json", json.loads(json.dumps(identity))
+        self._folder = folder / "batches"
+        if folder.exists() and not folder.is_dir():
+            raise WorstError(f"{folder} is a file; give a folder with --out")
+        if marker.is_file():
+            present = parse_json(read_text(marker, "search", WorstError), str(marker), WorstError)
+            if present != wanted:
+                different = sorted(k for k in wanted if not isinstance(present, dict) or present.get(k) != wanted[k])
+                raise WorstError(
+                    f"{folder} belongs to another search ({', '.join(different)} differ); give another folder with --out"
+                )
+            if not resume:
+                raise WorstError(
+                    f"{folder} already holds this search; go on with --resume, or give another folder with --out"
+                )
+        elif folder.exists() and any(folder.iterdir()):
+            raise WorstError(f"{folder} is not empty and holds no search; give another folder with --out")
+        make_folder(self._folder, WorstError)
+        self._lock = lock_folder(folder, WorstError)
+        write_atomically(marker, json_text(wanted), WorstError)
+
+    def __enter__(self) -> _Log:
+        return self
+
+    def __exit__(self, *details: object) -> None:
+        self._lock.release()
+
+    def batch(self, key: object, play: Callable[[], list[Outcome]]) -> tuple[list[Outcome], float]:
+        """Return what came of a batch and the seconds that it took, from the disk where it was played before."""
+        name = hashlib.sha256(json.dumps(key, sort_keys=True).encode()).hexdigest()[:20]
+        path = self._folder / f"{name}.json"
+        if path.is_file():
+            data = parse_json(read_text(path, "batch", WorstError), str(path), WorstError)
+            return [Outcome(**row) for row in data["outcomes"]], float(data["seconds"])
+        began = time.perf_counter()
+        outcomes = play()
+        seconds = time.perf_counter() - began
+        data = {"seconds": round(seconds, 3), "outcomes": [asdict(outcome) for outcome in outcomes]}
+        with replacing(path, WorstError, durable=False) as partial:
+            partial.write_text(json_text(data))
+        return outcomes, seconds
+
+    def kept(self, name: str, value: int) -> int:
+        """Return a number that was decided once, deciding it now where it was not."""
+        path = self._folder / f"{name}.json"
+        if path.is_file():
+            return int(parse_json(read_text(path, name, WorstError), str(path), WorstError)[name])
+        write_atomically(path, json_text({name: value}), WorstError)
+        return value
+
+
+@dataclass(kw_only=True)
+class _Found:
+    """What a search found."""
+
+    sampled: list[Elite]
+    sample_again: dict[str, list[Outcome]]
+    """The falls of the sample, in each other engine."""
+    failures: list[Elite]
+    again: dict[str, dict[str, list[bool]]]
+    """Whether each failure fell, by its name and the engine, for each seed that was played."""
+    chosen: list[str]
+    """Names of the failures that differ, played with all seeds."""
+
+
+class _Search:
+    """One search at work."""
+
+    def __init__(self, prepared: PreparedSearch, log: _Log, players: Players, budget: float, watch: Watch) -> None:
+        self.prepared, self._log, self._players, self._watch = prepared, log, players, watch
+        self._budget, self._seed, self._batch = budget, prepared.request.seed, prepared.request.batch
+        self.archive, self._needed = Archive(prepared.ranges), Archive(prepared.ranges)
+        self.used = 0.0
+        self.played = self.fallen = self.generations = 0
+        self._cases: dict[str, Case] = {}
+
+    def scenario(self, case: Case) -> Scenario:
+        """Return a case as a scenario."""
+        return scenario_of(case, self.prepared.measures)
+
+    def case(self, name: str) -> Case:
+        """Return the reduced case of a failure."""
+        return self._cases[name]
+
+    def run(self) -> _Found:
+        """Return what was found when the budget is spent."""
+        sampled = self._sample()
+        fallen = [elite for elite in sampled if elite.outcome.fell]
+        again = {
+            v.label: self._play("sampled falls in other engines", [e.case for e in fallen], engine=v)
+            for v in self.prepared.others
+        }
+        self._reduce("what falls of the sample need", fallen[:_REDUCED], _NEEDED)
+        self._explore()
+        failures = sorted(self.archive.failures, key=lambda elite: len(elite.case.factors))
+        self._reduce("what each failure needs", failures, _SETTLED)
+        failures = self._needed.failures
+        self._cases = {elite.case.name: elite.case for elite in failures}
+        return _Found(sampled=sampled, sample_again=again, failures=failures, **self._again(failures))
+
+    def _play(
+        self, stage: str, cases: Sequence[Case], *, engine: Variant | None = None, seeds: Sequence[int] = (0,)
+    ) -> list[Outcome]:
+        """Return what comes of cases with each of some seeds, batch by batch: all seeds of the first case come first."""
+        variant = engine or self.prepared.engine
+        found: list[Outcome] = []
+        plays = [(case, seed) for case in cases for seed in seeds]
+        for at in range(0, len(plays), self._batch):
+            part = plays[at : at + self._batch]
+            self._report(stage)
+            key = [variant.label, variant.device, [[c.name, list(c.values), sorted(c.factors), s] for c, s in part]]
+            made: list[Play] = [(self.scenario(case), seed) for case, seed in part]
+            outcomes, seconds = self._log.batch(key, lambda made=made: self._players.play(made, variant))  # type: ignore[misc]
+            self.used += seconds
+            self.played += len(part)
+            self.fallen += sum(outcome.fell for outcome in outcomes)
+            found += outcomes
+        self._report(stage)
+        return found
+
+    def _report(self, stage: str) -> None:
+        left = max(self._budget - self.used, 0.0)
+        share = min(self.used / self._budget, 1.0)
+        status = WorstStatus(stage=stage, played=self.played, fallen=self.fallen, share=share, seconds_left=left)
+        self._watch(status)
+
+    def _random(self, *stream: int) -> np.random.Generator:
+        return np.random.default_rng([self._seed, *stream])
+
+    def _sample(self) -> list[Elite]:
+        """Return an independent sample of the whole ranges; its size is fixed before any of it is played."""
+        ranges = self.prepared.ranges
+        tried = [random_case(self._random(0, i), ranges, f"speed-{i}") for i in range(min(16, self._batch))]
+        began = self.used
+        self._play("measuring the speed", tried)
+        each = max((self.used - began) / len(tried), 1e-6)
+        count = self._log.kept("sample", max(min(int(_SAMPLED * self._budget / each), _MOST_SAMPLE), _LEAST_SAMPLE))
+        cases = [random_case(self._random(1, i), ranges, f"sample-{i}") for i in range(count)]
+        return _elites(cases, self._play("random sample", cases))
+
+    def _explore(self) -> None:
+        """Search until its share of the budget is spent, for at least one generation."""
+        while not self.generations or self.used < self._budget - min(_REST * self._budget, _REST_PLAYS * self._each):
+            names = [f"search-{self.generations}-{i}" for i in range(self._batch)]
+            cases = self.archive.propose(self._random(2, self.generations), names)
+            self.archive.add(_elites(cases, self._play("search", cases)))
+            self.generations += 1
+
+    def _reduce(self, stage: str, elites: Sequence[Elite], end: float) -> None:
+        """Take from cases that fall what their falls do not need, first from those at the front.
+
+        What remains goes into the archive. Those that are not done at the share ``end`` of the budget are left out.
+        """
+        reductions = [Reduction(elite, self._random(3, at)) for at, elite in enumerate(elites)]
+        while (turns := list(islice(waiting(reductions), self._batch))) and self.used < end * self._budget:
+            for (reduction, _), outcome in zip(turns, self._play(stage, [case for _, case in turns]), strict=True):
+                reduction.tell(outcome)
+        done = [reduction.elite for reduction in reductions if reduction.next is None]
+        for archive in (self.archive, self._needed):
+            archive.add(done)
+
+    @property
+    def _each(self) -> float:
+        """Return the mean time of a play so far [s]."""
+        return max(self.used / max(self.played, 1), 1e-6)
+
+    def _again(self, failures: Sequence[Elite]) -> dict[str, Any]:
+        """Play every failure again in all engines, and those that differ with more seeds."""
+        engines = [self.prepared.engine, *self.prepared.others]
+        cases = [elite.case for elite in failures]
+        again: dict[str, dict[str, list[bool]]] = {case.name: {} for case in cases}
+        for engine in engines:
+            for case, outcome in zip(cases, self._play("failures again", cases, engine=engine), strict=True):
+                again[case.name][engine.label] = [outcome.fell]
+        confirmed = [case for case in cases if again[case.name][self.prepared.engine.label][0]]
+        more = range(1, SEEDS)
+        time_for = int((self._budget - self.used) / (self._each * len(more) * len(engines)))
+        most = min(max(time_for, GALLERY // 2), GALLERY + 2)
+        chosen = [confirmed[i] for i in choose_different(confirmed, self.prepared.ranges, most)]
+        for engine in engines:
+            outcomes = self._play("failures with other seeds", chosen, engine=engine, seeds=more)
+            for at, case in enumerate(chosen):
+                own = outcomes[at * len(more) : (at + 1) * len(more)]
+                again[case.name][engine.label] += [outcome.fell for outcome in own]
+        return {"again": again, "chosen": [case.name for case in chosen]}
+
+
+def _elites(cases: Sequence[Case], outcomes: Iterable[Outcome]) -> list[Elite]:
+    return [Elite(case, outcome) for case, outcome in zip(cases, outcomes, strict=True)]
+
+
+def _results(prepared: PreparedSearch, search: _Search, found: _Found, command: Sequence[str]) -> dict[str, Any]:
+    """Return the content of ``worst.json``."""
+    others = [variant.label for variant in prepared.others]
+    failures = [_failure(prepared, elite, found) for elite in found.failures]
+    gallery = [f for f in failures if f["name"] in found.chosen and f["confirmed"]]
+    gallery.sort(key=lambda f: (f["only_here"], f["hardness"]))
+    for rank, failure in enumerate(gallery[:GALLERY], 1):
+        failure |= {"rank": rank, "scenario": f"scenarios/worst-{rank:02d}.toml", "film": None}
+    falls = sum(elite.outcome.fell for elite in found.sampled)
+    results: dict[str, Any] = {
+        "schema": SCHEMA,
+        "policy": describe(prepared.label, prepared.loaded),
+        "suite": prepared.request.suite,
+        "engine": prepared.engine.label,
+        "family": engine_class(prepared.engine.backend).family,
+        "others": [{"engine": v.label, "family": engine_class(v.backend).family} for v in prepared.others],
+        "skipped": prepared.skipped,
+        "seed": prepared.request.seed,
+        "minutes": prepared.request.minutes,
+        "ranges": {name: list(pair) for name, pair in asdict(prepared.ranges).items()},
+        "rules": {
+            "cause_apart": CAUSE_APART,
+            "values_apart": VALUES_APART,
+            "seeds": SEEDS,
+            "confidence": CONFIDENCE,
+        },
+        "sample": {
+            "cases": len(found.sampled),
+            "falls": falls,
+            "diverged": sum(elite.outcome.diverged for elite in found.sampled),
+            "bound": upper_bound(falls, len(found.sampled)),
+            "again": {label: sum(o.fell for o in found.sample_again[label]) for label in others},
+        },
+        "search": {"generations": search.generations, "plays": search.played, "falls": search.fallen},
+        "failures": failures,
+        "provenance": provenance(
+            command=command,
+            device=prepared.engine.device,
+            threads=cpu_threads(prepared.request.threads),
+            seconds=round(search.used, 1),
+        ),
+    }
+    return results | {"sentences": sentences(results)}
+
+
+def _failure(prepared: PreparedSearch, elite: Elite, found: _Found) -> dict[str, Any]:
+    """Return what is said of a failure."""
+    case, again = elite.case, found.again[elite.case.name]
+    here = again[prepared.engine.label]
+    elsewhere = [any(again[variant.label]) for variant in prepared.others]
+    return {
+        "name": case.name,
+        "factors": list(case.words),
+        "words": describe_case(case, prepared.measures),
+        "values": {p.name: v for p, v in zip(PARAMETERS, case.values, strict=True) if p.factor in case.factors},
+        "hardness": hardness(case, prepared.ranges),
+        "seconds": elite.outcome.seconds,
+        "diverged": elite.outcome.diverged,
+        "again": again,
+        "confirmed": here[0] and 2 * sum(here) >= len(here),
+        "only_here": bool(elsewhere) and not any(elsewhere),
+        "rank": None,
+        "scenario": None,
+        "film": None,
+    }
+
+
+def sentences(results: dict[str, Any]) -> list[str]:
+    """Return the findings in sentences."""
+    label, sample, failures = results["policy"]["label"], results["sample"], results["failures"]
+    percent = f"{100 * results['rules']['confidence']:g} %"
+    found = [
+        f"{label} fell in {sample['falls']} of {sample['cases']} cases drawn uniformly from the ranges: the probability of a fall is "
+        f"at most {100 * sample['bound']:.1f} % ({percent} confidence, Clopper and Pearson; equal weights)."
+    ]
+    found += [
+        f"Of these falls, {count} are falls in {engine} too."
+        for engine, count in sample["again"].items()
+        if sample["falls"]
+    ]
+    plays = results["search"]["plays"]
+    if not failures and results["search"]["falls"]:
+        more = "go on with --resume and more --minutes"
+        return [
+            *found,
+            f"The budget ended before it was known what the falls need that were found in {plays} plays; {more}.",
+        ]
+    if not failures:
+        return [*found, f"The search found no failure in {plays} plays."]
+    if any(not failure["factors"] for failure in failures):
+        found.append("It falls where nothing is unusual.")
+    gallery = [failure for failure in failures if failure["rank"] is not None]
+    shown = "1 that is confirmed" if len(gallery) == 1 else f"{len(gallery)} that are confirmed and differ in cause"
+    found.append(f"The search found falls with {_sets(len(failures))}, among them {shown}.")
+    alone = [failure for failure in failures if failure["only_here"]]
+    if results["others"]:
+        engines = ", ".join(other["engine"] for other in results["others"])
+        found.append(f"{len(alone)} of {len(failures)} occur in {results['engine']} alone and not in {engines}.")
+    else:
+        found.append("No other engine is installed here that could play them again.")
+    return found
+
+
+def _sets(count: int) -> str:
+    return "1 set of factors" if count == 1 else f"{count} sets of factors"
