@@ -78,7 +78,7 @@ def film_scenario(path: Path, prepared: PreparedSearch, scenario: Scenario, plac
         readouts.append(
             Readout(
                 label=label,
-                place=place,
+                place=f"{place} (pushed)" if is_pushed(scenario, now) else place,
                 friction=friction_at(scenario, now),
                 time=now,
                 command=command_at(scenario, now),
@@ -121,3 +121,8 @@ def friction_at(scenario: Scenario, time: float) -> float:
     """Return the friction of the ground at a time after the start [s]."""
     acting = [p.friction for p in scenario.patches if p.begin < time <= p.begin + p.seconds]
     return acting[-1] if acting else scenario.friction
+
+
+def is_pushed(scenario: Scenario, time: float) -> bool:
+    """Return whether a push of fixed time acts at a time after the start [s]."""
+    return any(force.begin[0] < time <= force.begin[0] + force.seconds[0] for force in scenario.forces)

@@ -7,7 +7,7 @@ few factors and little of each. Everything here is a pure function of a generato
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -25,8 +25,8 @@ _NEW, _ADD, _DROP = 0.3, 0.15, 0.15
 """Chances that a case is new, and that one that is changed gains or loses a factor."""
 _REACH = 0.15
 """Standard deviation of a change, share of the range."""
-_MILDER = 0.4
-"""Largest share of the way to the nominal values that a case which falls is moved."""
+_PULL = 0.4
+"""Largest share of the way that sizes are moved: to the nominal values in a case that falls, else to the ends of the ranges."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,7 +85,8 @@ class Archive:
     ) -> Case:
         if not held or random.random() < _NEW:
             count = int(random.integers(1, MOST_FACTORS + 1))
-            return random_case(random, self.ranges, name, random.choice(FACTORS, count, replace=False))
+            case = random_case(random, self.ranges, name, random.choice(FACTORS, count, replace=False))
+            return self._moved(random, name, case.named, case.factors, outwards=True, least=_PULL, reach=0.0)
         elite = held[int(random.choice(len(held), p=weights / weights.sum()))]
         return self._change(random, elite, name)
 
@@ -98,15 +99,30 @@ class Archive:
             factors.add(new)
         elif chance > 1.0 - _DROP and len(factors) > 1:
             factors.remove(str(random.choice(sorted(factors))))
-        milder = random.uniform(0.0, _MILDER) if elite.outcome.fell else 0.0
+        return self._moved(random, name, values, factors, outwards=not elite.outcome.fell, least=0.0, reach=_REACH)
+
+    def _moved(
+        self,
+        random: np.random.Generator,
+        name: str,
+        values: dict[str, float],
+        factors: Iterable[str],
+        *,
+        outwards: bool,
+        least: float,
+        reach: float,
+    ) -> Case:
+        """Return a case with sizes moved to the ends of the ranges, or to the nominal values, and everything scattered."""
+        share, has = random.uniform(least, 2.0 * least or _PULL), frozenset(factors)
         for parameter in PARAMETERS:
-            if parameter.factor in factors:
+            if parameter.factor in has:
                 low, high = bounds(self.ranges, parameter.range)
-                value = values[parameter.name] + random.normal(0.0, _REACH) * (high - low)
+                value = values[parameter.name] + random.normal(0.0, reach) * (high - low)
                 if parameter.sized:
-                    value += milder * (parameter.nominal - value)
+                    end = high if value > parameter.nominal else low
+                    value += share * ((end if outwards else parameter.nominal) - value)
                 values[parameter.name] = min(max(value, low), high)
-        return make_case(name, values, factors)
+        return make_case(name, values, has)
 
 
 _FACTOR = {p.name: p.factor for p in PARAMETERS}

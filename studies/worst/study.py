@@ -335,7 +335,7 @@ class _Search:
 
     def _explore(self) -> None:
         """Search until its share of the budget is spent, for at least one generation."""
-        while not self.generations or self.used < self._budget - min(_REST * self._budget, _REST_PLAYS * self._each):
+        while not self.generations or self.used < self._budget - self._rest:
             names = [f"search-{self.generations}-{i}" for i in range(self._batch)]
             cases = self.archive.propose(self._random(2, self.generations), names)
             self.archive.add(_elites(cases, self._play("search", cases)))
@@ -344,15 +344,19 @@ class _Search:
     def _reduce(self, stage: str, elites: Sequence[Elite], end: float) -> None:
         """Take from cases that fall what their falls do not need, first from those at the front.
 
-        What remains goes into the archive. Those that are not done at the share ``end`` of the budget are left out.
+        What remains goes into the archive. Those that are not done at the share ``end`` of the budget wait for the next time.
         """
         reductions = [Reduction(elite, self._random(3, at)) for at, elite in enumerate(elites)]
         while (turns := list(islice(waiting(reductions), self._batch))) and self.used < end * self._budget:
             for (reduction, _), outcome in zip(turns, self._play(stage, [case for _, case in turns]), strict=True):
                 reduction.tell(outcome)
-        done = [reduction.elite for reduction in reductions if reduction.next is None]
-        for archive in (self.archive, self._needed):
-            archive.add(done)
+        self.archive.add([reduction.elite for reduction in reductions])
+        self._needed.add([reduction.elite for reduction in reductions if reduction.next is None])
+
+    @property
+    def _rest(self) -> float:
+        """Return the time that what follows the search takes [s]."""
+        return min(_REST * self._budget, _REST_PLAYS * self._each) if self.archive.failures else 0.0
 
     @property
     def _each(self) -> float:
