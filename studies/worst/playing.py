@@ -11,7 +11,10 @@ from concurrent.futures.process import BrokenProcessPool
 from functools import partial
 from typing import Any
 
+import torch
+
 from ...backends.base import BackendError
+from ...backends.registry import engine_class
 from ...files.cell import CONTEXT
 from ...gauge.play.workers import local_workers
 from ...policy.base import Policy
@@ -32,7 +35,7 @@ class Players:
 
     def __init__(self, policy: FilePolicy, robot: Robot, threads: int) -> None:
         self._policy, self._robot, self._threads = policy, robot, threads
-        self._pool: ProcessPoolExecutor | None = None
+        self._pools: dict[bool, ProcessPoolExecutor] = {}
 
     def play(self, plays: Sequence[Play], variant: Variant) -> list[Outcome]:
         """Return what comes of each play.
@@ -44,13 +47,15 @@ class Players:
         count = local_workers(variant.backend, variant.device, threads=self._threads, most=len(plays))
         if count == 1:
             return _play(self._policy, self._robot, variant, self._threads, plays)
-        if self._pool is None:
+        forked = engine_class(variant.backend).forkable()
+        if forked not in self._pools:
             job = (self._policy.stored, self._policy.contract, self._policy.path, self._robot)
-            self._pool = ProcessPoolExecutor(self._threads, CONTEXT, _begin, job)
+            context = CONTEXT if forked else multiprocessing.get_context("spawn")
+            self._pools[forked] = ProcessPoolExecutor(self._threads, context, _begin, job)
         found: list[Any] = [None] * len(plays)
         parts = [plays[part::count] for part in range(count)]
         try:
-            for part, outcomes in enumerate(self._pool.map(partial(_play_here, variant), parts)):
+            for part, outcomes in enumerate(self._pools[forked].map(partial(_play_here, variant), parts)):
                 found[part::count] = outcomes
         except BrokenProcessPool as error:
             raise BackendError(
@@ -63,11 +68,11 @@ class Players:
         return self
 
     def __exit__(self, kind: object, *details: object) -> None:
-        if self._pool is not None:
-            if kind is not None:  # what is being played would have to end first
-                for process in multiprocessing.active_children():
-                    process.terminate()
-            self._pool.shutdown(cancel_futures=True)
+        if kind is not None:  # what is being played would have to end first
+            for process in multiprocessing.active_children():
+                process.terminate()
+        for pool in self._pools.values():
+            pool.shutdown(cancel_futures=True)
 
 
 _here: dict[str, Any] = {}
@@ -75,6 +80,7 @@ _here: dict[str, Any] = {}
 
 
 def _begin(stored: Any, contract: Any, path: str, robot: Robot) -> None:
+    torch.set_num_threads(1)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent process handles Ctrl-C
     gc.freeze()
     _here.update(policy=restore_policy(stored, contract, path, robot), robot=robot)
