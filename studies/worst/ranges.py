@@ -33,31 +33,31 @@ class Ranges:
 
     command: Range = (-1.0, 1.0)
     """Forward, lateral and turning speed of each command, shares of the policy's command limits."""
-    push: Range = (-0.6, 0.6)
+    push: Range = (-1.0, 1.0)
     """Force on the base, forward and to the left, shares of the robot's weight."""
     push_begin: Range = (0.5, 4.5)
     """Time of the push after the start [s]."""
     push_seconds: Range = (0.1, 0.3)
     """Length of the push [s]."""
-    friction: Range = (0.3, 1.0)
+    friction: Range = (0.2, 1.0)
     """Sliding friction coefficient of the ground."""
-    patch_friction: Range = (0.1, 0.8)
+    patch_friction: Range = (0.05, 0.8)
     """Sliding friction coefficient of a patch of ground, wider than the robot."""
     patch_begin: Range = (0.5, 4.5)
     """Time at which the robot comes onto the patch [s]."""
-    patch_seconds: Range = (0.2, 1.0)
+    patch_seconds: Range = (0.2, 1.5)
     """Time for which it is on the patch [s]."""
-    payload: Range = (0.0, 0.3)
+    payload: Range = (0.0, 0.4)
     """Mass of a load on the base, share of the robot's mass."""
     payload_along: Range = (-0.4, 0.4)
     """Its place forward and to the left of the base's centre of mass, shares of the leg length."""
     payload_above: Range = (0.0, 0.4)
     """Its place above the base's centre of mass, share of the leg length."""
-    latency: Range = (0.0, 0.04)
+    latency: Range = (0.0, 0.06)
     """Time by which every action takes effect late [s]."""
-    slope: Range = (-0.3, 0.3)
+    slope: Range = (-0.5, 0.5)
     """Inclination of 3 m of ground, positive uphill [rad]."""
-    step: Range = (-0.3, 0.3)
+    step: Range = (-0.5, 0.5)
     """Height of a step, positive upwards, share of the leg length."""
     step_count: Range = (1.0, 4.0)
     """Number of steps."""
@@ -95,19 +95,19 @@ PARAMETERS: tuple[Parameter, ...] = (
     Parameter(name="push_forward", factor="push", range="push", nominal=0.0),
     Parameter(name="push_left", factor="push", range="push", nominal=0.0),
     _parameter("push", "push_begin", 2.0, sized=False),
-    _parameter("push", "push_seconds", 0.2, sized=False),
+    _parameter("push", "push_seconds", 0.1),
     _parameter("friction", "friction", 0.8),
     _parameter("patch", "patch_friction", 0.8),
     _parameter("patch", "patch_begin", 2.0, sized=False),
     _parameter("patch", "patch_seconds", 0.2),
     _parameter("payload", "payload", 0.0),
-    Parameter(name="payload_forward", factor="payload", range="payload_along", nominal=0.0, sized=False),
-    Parameter(name="payload_left", factor="payload", range="payload_along", nominal=0.0, sized=False),
-    _parameter("payload", "payload_above", 0.0, sized=False),
+    Parameter(name="payload_forward", factor="payload", range="payload_along", nominal=0.0),
+    Parameter(name="payload_left", factor="payload", range="payload_along", nominal=0.0),
+    _parameter("payload", "payload_above", 0.0),
     _parameter("latency", "latency", 0.0),
     _parameter("slope", "slope", 0.0),
     _parameter("steps", "step", 0.0),
-    _parameter("steps", "step_count", 1.0, sized=False, whole=True),
+    _parameter("steps", "step_count", 1.0, whole=True),
     _parameter("steps", "heading", 0.0, sized=False),
 )
 FACTORS: tuple[str, ...] = tuple(dict.fromkeys(p.factor for p in PARAMETERS))

@@ -23,6 +23,8 @@ CAUSE_APART, VALUES_APART = 0.5, 0.15
 CONFIDENCE = 0.95
 _NEW, _ADD, _DROP = 0.3, 0.15, 0.15
 """Chances that a case is new, and that one that is changed gains or loses a factor."""
+_ENDS = 0.5
+"""Chance that a new case has all sizes at the ends of their ranges: hard cases first, which then become milder."""
 _REACH = 0.15
 """Standard deviation of a change, share of the range."""
 _PULL = 0.4
@@ -86,7 +88,8 @@ class Archive:
         if not held or random.random() < _NEW:
             count = int(random.integers(1, MOST_FACTORS + 1))
             case = random_case(random, self.ranges, name, random.choice(FACTORS, count, replace=False))
-            return self._moved(random, name, case.named, case.factors, outwards=True, least=_PULL, reach=0.0)
+            share = 1.0 if random.random() < _ENDS else random.uniform(0.0, 1.0)
+            return self._moved(random, name, case.named, case.factors, outwards=True, share=share, reach=0.0)
         elite = held[int(random.choice(len(held), p=weights / weights.sum()))]
         return self._change(random, elite, name)
 
@@ -99,7 +102,8 @@ class Archive:
             factors.add(new)
         elif chance > 1.0 - _DROP and len(factors) > 1:
             factors.remove(str(random.choice(sorted(factors))))
-        return self._moved(random, name, values, factors, outwards=not elite.outcome.fell, least=0.0, reach=_REACH)
+        share = random.uniform(0.0, _PULL)
+        return self._moved(random, name, values, factors, outwards=not elite.outcome.fell, share=share, reach=_REACH)
 
     def _moved(
         self,
@@ -109,11 +113,11 @@ class Archive:
         factors: Iterable[str],
         *,
         outwards: bool,
-        least: float,
+        share: float,
         reach: float,
     ) -> Case:
         """Return a case with sizes moved to the ends of the ranges, or to the nominal values, and everything scattered."""
-        share, has = random.uniform(least, 2.0 * least or _PULL), frozenset(factors)
+        has = frozenset(factors)
         for parameter in PARAMETERS:
             if parameter.factor in has:
                 low, high = bounds(self.ranges, parameter.range)
