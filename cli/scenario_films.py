@@ -79,7 +79,7 @@ def film_scenario(path: Path, prepared: PreparedSearch, scenario: Scenario, plac
             Readout(
                 label=label,
                 place=f"{place} (pushed)" if is_pushed(scenario, now) else place,
-                friction=friction_at(scenario, now),
+                friction=round(friction_at(scenario, now), 2),
                 time=now,
                 command=command_at(scenario, now),
                 speed=(forward, left, float(state.base_angular_velocity_b[0, 2])),

@@ -72,9 +72,9 @@ class Archive:
 
     @property
     def failures(self) -> list[Elite]:
-        """Return the cases that fall, the mildest first."""
+        """Return the cases that fall, those of the fewest factors first, then the mildest."""
         fallen = [elite for elite in self.cells.values() if elite.outcome.fell]
-        return sorted(fallen, key=lambda elite: (hardness(elite.case, self.ranges), elite.case.name))
+        return sorted(fallen, key=lambda e: (len(e.case.factors), hardness(e.case, self.ranges), e.case.name))
 
     def propose(self, random: np.random.Generator, names: Sequence[str]) -> list[Case]:
         """Return new cases, one for each name: some at random, the others changed from what the cells hold."""

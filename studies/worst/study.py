@@ -287,8 +287,7 @@ class _Search:
         }
         self._reduce("what falls of the sample need", fallen[:_REDUCED], _NEEDED)
         self._explore()
-        failures = sorted(self.archive.failures, key=lambda elite: len(elite.case.factors))
-        self._reduce("what each failure needs", failures, _SETTLED)
+        self._reduce("what each failure needs", self.archive.failures, _SETTLED)
         failures = self._needed.failures
         self._cases = {elite.case.name: elite.case for elite in failures}
         return _Found(sampled=sampled, sample_again=again, failures=failures, **self._again(failures))
@@ -393,7 +392,7 @@ def _results(prepared: PreparedSearch, search: _Search, found: _Found, command: 
     others = [variant.label for variant in prepared.others]
     failures = [_failure(prepared, elite, found) for elite in found.failures]
     gallery = [f for f in failures if f["name"] in found.chosen and f["confirmed"]]
-    gallery.sort(key=lambda f: (f["only_here"], f["hardness"]))
+    gallery.sort(key=lambda f: (f["only_here"], len(f["factors"]), f["hardness"]))
     for rank, failure in enumerate(gallery[:GALLERY], 1):
         failure |= {"rank": rank, "scenario": f"scenarios/worst-{rank:02d}.toml", "film": None}
     falls = sum(elite.outcome.fell for elite in found.sampled)
