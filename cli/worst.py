@@ -76,7 +76,9 @@ def _show(display: ProgressDisplay, status: WorstStatus) -> None:
 def print_worst(console: Terminal, results: Mapping[str, Any]) -> None:
     """Print the failures of the gallery, and the findings in sentences."""
     engines = [results["engine"], *(other["engine"] for other in results["others"])]
-    table = make_table("falls that differ in cause, those of the fewest conditions first", "", "conditions", "after", *engines)
+    table = make_table(
+        "falls that differ in cause, those of the fewest conditions first", "", "conditions", "after", *engines
+    )
     ranked = [failure for failure in results["failures"] if failure["rank"] is not None]
     for failure in sorted(ranked, key=lambda f: f["rank"]):
         shares = [f"{sum(failure['again'][name])}/{len(failure['again'][name])}" for name in engines]
