@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,7 @@ def deploy_contract(path: Path, robot: Robot) -> PolicyContract:
     return read_deploy(data, path, robot)
 
 
-def read_deploy(data: Mapping[str, Any], path: Path, asked: Robot | None) -> PolicyContract:
+def read_deploy(data: Mapping[str, Any], path: Path, asked: Robot | None, *, of_mjlab: bool = False) -> PolicyContract:
     """Return the contract that a ``deploy.yaml`` describes.
 
     In it ``stiffness`` and ``damping`` are in the order of the robot's SDK, everything else is in the policy's; entry i
@@ -35,11 +36,21 @@ def read_deploy(data: Mapping[str, Any], path: Path, asked: Robot | None) -> Pol
     ``use_gym_history`` is set, and start with copies of the first observation. Clipping comes before scaling unless
     ``scale_first`` is set; a clip of the action limits the joint target.
 
+    Args:
+        of_mjlab: the policy's file has mjlab's metadata; unitree_rl_mjlab's gait phase is zero while the command is.
+
     Raises:
         PolicyError: the file is malformed, or asks for something that a contract cannot express.
     """
     with checked(path, "deploy.yaml"):
-        return _read(data, path, choose_robot(asked, None, path))
+        contract = _read(data, path, choose_robot(asked, None, path))
+    if not of_mjlab or not any(term.name == "gait_phase" for term in contract.observation):
+        return contract
+    terms = tuple(replace(t, at_rest="zeros") if t.name == "gait_phase" else t for t in contract.observation)
+    told = "; ".join(
+        filter(None, (contract.provenance.get("assumed"), "the gait phase is zero at rest, as unitree_rl_mjlab has it"))
+    )
+    return replace(contract, observation=terms, provenance={**contract.provenance, "assumed": told})
 
 
 def _read(data: Mapping[str, Any], path: Path, robot: Robot) -> PolicyContract:

@@ -46,7 +46,7 @@ Reader = Callable[[Mapping[str, Any], Path, Robot | None], PolicyContract]
 def _reader(data: Mapping[str, Any], facts: Facts) -> Reader | None:
     """Return what reads a YAML table of some project, None where it is none that is known."""
     known: tuple[tuple[Callable[[Mapping[str, Any]], bool], Reader], ...] = (
-        (is_deploy, read_deploy),
+        (is_deploy, partial(read_deploy, of_mjlab="observation_names" in facts.metadata)),
         (is_rl_sar, partial(read_rl_sar, inputs=facts.inputs)),
         (is_env, read_env),
         (is_legged_gym, read_legged_gym),

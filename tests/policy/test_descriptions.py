@@ -43,6 +43,7 @@ from foreign_play import (
 )
 from gaitgauge.policy.base import PolicyError
 from gaitgauge.policy.foreign.adapters import described as described_in_words
+from gaitgauge.policy.foreign.deploy_yaml import read_deploy
 from gaitgauge.policy.loading import load_policy
 from gaitgauge.policy.observation import ObservationBuilder
 from onnx import helper
@@ -75,6 +76,14 @@ def test_a_deploy_file_with_a_gait_phase_and_an_offset(tmp_path):
     check(policy, frame, newest, simply(module))
     targets = ObservationBuilder(policy.contract, GO2, 1).targets(torch.ones(1, 12))[0]
     np.testing.assert_allclose(targets[:3], [0.25, 1.15, -1.55], atol=1e-6)
+
+
+def test_a_gait_phase_of_unitree_rl_mjlab_is_zero_at_rest(tmp_path):
+    phase = {"gait_phase": {"params": {"period": 0.6}, "clip": None, "scale": 1.0, "history_length": 1}}
+    data = yaml.safe_load(deploy(terms=phase))
+    found = [read_deploy(data, tmp_path / "deploy.yaml", GO2, of_mjlab=mjlab) for mjlab in (False, True)]
+    assert [contract.observation[-1].at_rest for contract in found] == ["runs", "zeros"]
+    assert found[1].provenance["assumed"] == "the gait phase is zero at rest, as unitree_rl_mjlab has it"
 
 
 def test_histories_of_different_lengths_in_a_deploy_file(tmp_path):
