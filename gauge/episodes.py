@@ -22,7 +22,7 @@ _LARGEST = 10**9
 QUALITY = "quality"
 """Column of the sample table that holds the quality of each sample."""
 MOTION = "motion_done"
-"""Metric with the share of the commanded motion that a sample does; a suite that lists it multiplies a goal's quality by its mean."""
+"""Metric with the share of the commanded motion that a sample does; the square of its mean multiplies a goal's quality."""
 
 
 class RecordError(ValueError):

@@ -31,7 +31,7 @@ def tail_means(samples: Array) -> Array:
 def run_statistics(record: Record, column: int) -> Array:
     """``tail_means`` of one column averaged over the goals of an episode, (3,). A goal without samples counts zero.
 
-    The quality of a goal counts for the share of the commanded motion that is done, where the suite measures it.
+    The quality of a goal counts for the square of the share of the commanded motion that is done, where the suite measures it.
     """
     return goal_statistics(record, column).mean(0)
 
@@ -54,13 +54,13 @@ def command_statistics(record: Record, column: int) -> dict[tuple[int, int], Arr
 
 
 def _statistics(record: Record, column: int, mine: NDArray[np.bool_]) -> Array:
-    """Return ``tail_means`` of one column over some samples; those of the quality times the mean of ``MOTION``."""
+    """Return ``tail_means`` of one column over some samples; those of the quality times the square of the mean of ``MOTION``."""
     samples = record.samples[mine].astype(np.float64)
     found = tail_means(samples[:, column])
     if MOTION not in record.columns or record.columns[column] != QUALITY:
         return found
     done = samples[:, record.columns.index(MOTION)]
-    return found if np.isnan(done).all() else found * tail_means(done)[0]
+    return found if np.isnan(done).all() else found * tail_means(done)[0] ** 2
 
 
 class LevelWeights(Protocol):

@@ -28,8 +28,8 @@ _SHRUNK = 0.5
 _USUAL = 0.1
 """Variance of one environment's level that is supposed beforehand, and counts as much as that of one environment."""
 
-_CAUTION = 1.12
-"""Factor on variances, which leaves false alarms of comparisons below 5 % and not at it."""
+_CAUTION = 1.25
+"""Factor on variances: how fast the quality falls with the level is known roughly, and false alarms should stay below 5 %."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -126,7 +126,7 @@ def test_nor_does_one_that_begins_later_or_stands_between(still, seed):
 
 def test_without_the_factor_a_slower_robot_scores_more():
     """The property that version 1.0.0 lacked: it is the factor that holds it, not the walker that is drawn."""
-    whole, slow = (quality(share, np.random.default_rng(3))[0] / (0.95 * share) for share in (1.0, 0.7))
+    whole, slow = (quality(share, np.random.default_rng(3))[0] / (0.95 * share) ** 2 for share in (1.0, 0.7))
     assert slow > whole
 
 
@@ -141,14 +141,14 @@ def test_the_share_of_a_motion_is_its_part_along_the_command():
     assert math.isnan(motion_done(torch.tensor([[1.0, 0.0, 0.0]]), torch.zeros(1, 3), limits).item())
 
 
-def test_the_quality_of_a_goal_counts_for_the_motion_that_is_done():
+def test_the_quality_of_a_goal_counts_for_the_square_of_the_motion_that_is_done():
     samples = np.zeros((4, len(NAMES)), np.float32)
     samples[:, -1] = 0.8
     samples[:, -2] = [0.5, 1.5, np.nan, np.nan]  # a share above one is one; standing has none
     goals = np.array([0, 0, 0, 1], np.int16)
     record = Record(episode=EPISODE, columns=NAMES, samples=samples, goal_index=goals, part_index=goals)
     # the first goal did three quarters, the second was not asked to move
-    assert run_statistics(record, NAMES.index(QUALITY)) == pytest.approx([(0.75 * 0.8 + 0.8) / 2] * 3)
+    assert run_statistics(record, NAMES.index(QUALITY)) == pytest.approx([(0.75**2 * 0.8 + 0.8) / 2] * 3)
 
 
 # ---- the robot's own measure, and its feet ----------------------------------------------------------------------------
