@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -103,7 +104,8 @@ def _named_preset(name: str, asked: Robot | None, facts: Facts) -> PolicyContrac
 def contract_beside(path: Path) -> Path | None:
     """Return the contract of this project's kind that lies beside a policy, None where there is none."""
     names = (f"{path.stem}.contract.toml", "contract.toml", f"{path.stem}.contract.json", "contract.json")
-    return next((path.with_name(name) for name in names if path.with_name(name).is_file()), None)
+    # unlike a path, ``isfile`` is False for a name that is too long for the file system
+    return next((path.with_name(name) for name in names if os.path.isfile(path.with_name(name))), None)
 
 
 def find_description(path: Path, asked: Robot | None, facts: Facts) -> PolicyContract | None:
