@@ -110,7 +110,7 @@ def play(
         LogError: the simulated robot diverged.
     """
     shift = delay if delay is not None else parameters.delay or 0.0
-    targets = held_targets(log, shift, num_steps(log)) + np.asarray(parameters.target_offset or 0.0)
+    targets = held_targets(log, shift, num_steps(log))  # the engine adds the set's offsets
     with tempfile.TemporaryDirectory(prefix="gaitgauge-rig-") as folder:
         robot = hang(log.robot, Path(folder)) if log.held != "standing" else log.robot
         rig = _EngineRig(robot, acting_parameters(log, parameters), engine, device, hung=log.held != "standing")
