@@ -18,6 +18,11 @@ _OF_WRITING = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EPIPE, errno.EIO)
 """Errors of writing to standard output; a failed start of a process has no file name either."""
 
 
+_LEAST_MEMORY = 1_200_000_000
+"""Address space that torch, MuJoCo and one policy take [bytes]; with less, libraries crash or wait for ever."""
+_MORE_MEMORY = "raise the limit (ulimit -v), ask for fewer threads, or use a machine with more"
+
+
 class UserError(ValueError):
     """Report an error that the command line itself found."""
 
@@ -27,6 +32,7 @@ def report_errors(command: Callable[..., Any]) -> Callable[..., Any]:
 
     @functools.wraps(command)
     def wrapper(*args: Any, **kwargs: Any) -> Any:
+        check_memory()
         try:
             with held_notices():
                 result = command(*args, **kwargs)
@@ -35,9 +41,11 @@ def report_errors(command: Callable[..., Any]) -> Callable[..., Any]:
         except KeyboardInterrupt:
             complain("stopped")
             raise typer.Exit(130) from None
-        except (ValueError, RuntimeError, OSError) as error:
+        except (ValueError, RuntimeError, OSError, MemoryError, ImportError) as error:
             if _is_ours(error):
                 complain(f"gaitgauge: {error}")
+            elif isinstance(error, MemoryError) or "allocate memory" in str(error).lower():
+                complain(f"gaitgauge: memory is exhausted; {_MORE_MEMORY}")
             elif isinstance(error, OSError):
                 complain(f"gaitgauge: {system_failure(error)}")
             else:
@@ -57,6 +65,21 @@ def output_failures() -> Iterator[None]:
             sys.stdout.flush()
     except OSError as error:
         complain(f"gaitgauge: {system_failure(error)}")
+        sys.exit(2)
+
+
+def check_memory() -> None:
+    """End with exit code 2 where this process may take less memory than its libraries alone need."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return
+    allowed = resource.getrlimit(resource.RLIMIT_AS)[0]
+    if allowed != resource.RLIM_INFINITY and allowed < _LEAST_MEMORY:
+        complain(
+            f"gaitgauge: a process may take {allowed / 1e9:.2f} GB of address space here, and at least {_LEAST_MEMORY / 1e9:g} GB "
+            f"are needed; {_MORE_MEMORY}"
+        )
         sys.exit(2)
 
 

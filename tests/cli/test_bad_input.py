@@ -3,6 +3,7 @@
 import math
 import os
 import pickle
+import subprocess
 import sys
 import zipfile
 from dataclasses import replace
@@ -10,6 +11,8 @@ from pathlib import Path
 
 import pytest
 import torch
+import typer
+from gaitgauge.cli.errors import report_errors
 from gaitgauge.cli.main import main
 from gaitgauge.gauge.store import RunFolder
 from gaitgauge.policy.native import save_policy
@@ -299,3 +302,23 @@ def test_no_machine_has_so_many_threads(run, command, threads, limit):
     result = run(command, "pretrained", "--threads", threads)
     assert result.exit_code == 2
     assert f"than or equal to {limit} " in result.stderr
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="limits of address space")
+@pytest.mark.parametrize("words", [("evaluate", "pretrained"), ("list", "suites")])
+def test_too_little_memory_is_one_sentence(words):
+    """Libraries crashed, or waited for ever."""
+    limit = "import resource, sys; resource.setrlimit(resource.RLIMIT_AS, (700_000_000,) * 2); "
+    program = limit + f"from gaitgauge.cli.main import app; sys.argv[1:] = {list(words)}; app()"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 2 and done.stdout == ""
+    assert done.stderr.startswith("gaitgauge: a process may take 0.70 GB of address space here, and at least 1.2 GB")
+
+
+def test_memory_that_runs_out_is_one_sentence(capsys):
+    def command():
+        raise MemoryError
+
+    with pytest.raises(typer.Exit) as ended:
+        report_errors(command)()
+    assert ended.value.exit_code == 2 and "gaitgauge: memory is exhausted; raise the limit" in capsys.readouterr().err
