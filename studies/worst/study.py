@@ -54,6 +54,8 @@ _SAMPLED = 0.35
 """Share of the budget that the random sample takes."""
 _NEEDED, _SETTLED = 0.5, 0.85
 """Shares of the budget at which it is no longer asked what the falls of the sample need, and what those of the search need."""
+_ROUNDS = 3
+"""Rounds of such questions that are played in any case: enough for up to two factors."""
 _REST, _REST_PLAYS = 0.4, 330
 """Largest share of the budget that is left to what follows the search, and about the plays that it takes."""
 _LEAST_SAMPLE, _MOST_SAMPLE = 30, 10_000
@@ -343,10 +345,14 @@ class _Search:
     def _reduce(self, stage: str, elites: Sequence[Elite], end: float) -> None:
         """Take from cases that fall what their falls do not need, first from those at the front.
 
-        What remains goes into the archive. Those that are not done at the share ``end`` of the budget wait for the next time.
+        What remains goes into the archive. Those that are not done at the share ``end`` of the budget wait.
         """
         reductions = [Reduction(elite, self._random(3, at)) for at, elite in enumerate(elites)]
-        while (turns := list(islice(waiting(reductions), self._batch))) and self.used < end * self._budget:
+        rounds = 0
+        while turns := list(islice(waiting(reductions), self._batch)):
+            if rounds >= _ROUNDS and self.used >= end * self._budget:
+                break
+            rounds += 1
             for (reduction, _), outcome in zip(turns, self._play(stage, [case for _, case in turns]), strict=True):
                 reduction.tell(outcome)
         self.archive.add([reduction.elite for reduction in reductions])

@@ -129,6 +129,11 @@ def test_a_robot_that_always_falls_needs_no_condition(searched, tmp_path):
     assert "It falls where nothing is unusual." in results["sentences"]
 
 
+def test_a_small_budget_finds_what_falls_alone(searched, tmp_path):
+    results = searched(lambda scenario, _: scenario.latency is not None, tmp_path / "out", minutes=0.1)
+    assert [failure["factors"] for failure in results["failures"]] == [["latency"]]
+
+
 def test_a_search_goes_on_where_it_stopped(searched, tmp_path):
     first = searched(frail, tmp_path / "out", minutes=0.4)
     once = len(searched.plays)
