@@ -267,7 +267,7 @@ def _ground(case: Case, measures: Measures) -> Ground:
         course.append(Stretch(length=round(_TREAD * count, _DIGITS), rise=steps, steps=count))
     course.append(Stretch(length=_BEYOND))
     lowest = min(0.0, slope, slope + steps)
-    return Ground(begin=-_BEHIND, height=round(-lowest, _DIGITS), width=_WIDE, stretches=tuple(course))
+    return Ground(begin=-_BEHIND, height=round(abs(lowest), _DIGITS), width=_WIDE, stretches=tuple(course))
 
 
 def describe_case(case: Case, measures: Measures) -> list[str]:

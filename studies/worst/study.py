@@ -452,7 +452,7 @@ def _failure(prepared: PreparedSearch, elite: Elite, found: _Found) -> dict[str,
         "seconds": elite.outcome.seconds,
         "diverged": elite.outcome.diverged,
         "again": again,
-        "confirmed": here[0] and 2 * sum(here) >= len(here),
+        "confirmed": len(here) == SEEDS and 2 * sum(here) >= SEEDS,
         "only_here": bool(elsewhere) and not any(elsewhere),
         "rank": None,
         "scenario": None,
@@ -490,7 +490,9 @@ def sentences(results: dict[str, Any]) -> list[str]:
     alone = [failure for failure in failures if failure["only_here"]]
     if results["others"]:
         engines = ", ".join(other["engine"] for other in results["others"])
-        found.append(f"{len(alone)} of {len(failures)} occur in {results['engine']} alone and not in {engines}.")
+        found.append(
+            f"With the seeds that were played, {len(alone)} of {len(failures)} fall in {results['engine']} alone, not in {engines}."
+        )
     else:
         found.append("No other engine is installed here that could play them again.")
     return found

@@ -236,6 +236,7 @@ def test_a_case_as_a_scenario_in_the_robot_s_own_measure():
     assert any("push of 74 N at -53° from ahead" in w for w in words) and any(
         "2 steps up of 0.10 m" in w for w in words
     )
+    assert str(scenario_of(make_case("up", values | {"slope": 0.2}, FACTORS), MEASURES).ground.height) == "0.0"
     bare = scenario_of(make_case("bare", values, ()), MEASURES)
     assert (bare.forces, bare.patches, bare.payload, bare.latency) == ((), (), None, None)
     assert bare.commands[1].velocity == (1.0, 0.0, 0.0) and not bare.terrain().boxes
