@@ -57,7 +57,7 @@ def test_two_settings_of_the_c_engine(run, refused, tmp_path, policy, tiny, monk
     assert "--resume" in refused(*command)
     again = run(*command, "--resume")
     assert again.exit_code == 0, again.output
-    for words in ("models: largest relative difference", "open loop", "closed loop", "attribution", "gap"):
+    for words in ("models: the largest difference from mujoco", "open loop", "closed loop", "attribution", "gap"):
         assert words in again.stdout
     assert "mujoco – mujoco@timestep=0.005" in again.stdout
     assert str(out / "consistency.html") in again.stdout.replace("\n", "")

@@ -59,7 +59,7 @@ def test_variants_are_read_and_named():
         ("mujoco@substeps=3", "no physics option"),
         ("mujoco@timestep=fast", "'@timestep' is 'fast'; it must be a number"),
         ("mujoco@timestep=nan", "it must be a finite number"),
-        ("mujoco@timestep=-0.005", "it must be greater than 0"),
+        ("mujoco@timestep=-0.005", "it must be greater than or equal to 0.00001"),
         ("mujoco@iterations=1.5", "it must be a whole number"),
         ("mujoco@iterations=-1", "it must be greater than or equal to 1"),
         ("mujoco@cone=square", "it must be 'elliptic' or 'pyramidal'"),

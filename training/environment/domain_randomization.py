@@ -87,21 +87,21 @@ class MotorParameters:
     ) -> None:
         """Prepare motors as the robot's parameter set says; ``offset`` is the one that a measured set has [rad], (J,)."""
         bounds = [getattr(ranges, name) for name in MOTOR_COLUMNS]
-        self._low = torch.tensor([low for low, _ in bounds], device=device)[:, None]
+        shift = torch.zeros(len(self.NEUTRAL), num_joints, device=device)
+        if offset is not None:
+            shift[-1] = torch.tensor(offset, device=device)
+        self._low = torch.tensor([low for low, _ in bounds], device=device)[:, None] + shift
         self._span = torch.tensor([high - low for low, high in bounds], device=device)[:, None]
         neutral = torch.tensor(list(self.NEUTRAL.values()), device=device)[:, None]
         self._varied = [
             name for name, bound in zip(self.NEUTRAL, bounds, strict=True) if set(bound) != {self.NEUTRAL[name]}
         ]
-        self._shift = torch.zeros(len(self.NEUTRAL), num_joints, device=device)
-        if offset is not None:
-            self._shift[-1] = torch.tensor(offset, device=device)
-        self.values = neutral.repeat(num_envs, 1, num_joints) + self._shift
+        self.values = neutral.repeat(num_envs, 1, num_joints) + shift
         """All of them, (N, 5, J)."""
 
     def redraw(self, uniform: torch.Tensor, worlds: torch.Tensor) -> None:
         """Draw new values, in place, for the masked worlds, from uniform numbers (N, 5 J)."""
-        drawn = uniform.view(self.values.shape) * self._span + self._low + self._shift
+        drawn = uniform.view(self.values.shape) * self._span + self._low
         torch.where(worlds[:, None, None], drawn, self.values, out=self.values)
 
     def apply(self, backend: PhysicsBackend) -> None:
