@@ -28,7 +28,7 @@ _SHRUNK = 0.5
 _USUAL = 0.1
 """Variance of one environment's level that is supposed beforehand, and counts as much as that of one environment."""
 
-_CAUTION = 1.25
+_CAUTION = 1.2
 """Factor on variances: how fast the quality falls with the level is known roughly, and false alarms should stay below 5 %."""
 
 

@@ -106,7 +106,7 @@ def test_jobs_that_have_ended_are_not_played_again(tmp_path, monkeypatch):
         file.write('{"key": "none | fl')  # killed while it wrote
     scores = Scores()
     cheats.play_all(jobs, tmp_path, 1, scores)
-    assert played == ["none | flat | 0-4", "none | flat | 5-7"]
+    assert played == ["none | flat 0.3,0.6,0.9 | 0-4", "none | flat 0.3,0.6,0.9 | 5-7"]
     assert len(scores.found) == 3 * 8
     cheats.play_all(jobs, tmp_path, 1, scores)
     assert len(played) == 2
