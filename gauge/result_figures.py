@@ -84,7 +84,7 @@ def _figures(result: Result, *, intervals: bool) -> Iterator[Figure]:
     for name in ("score", "score_interval", "level", "level_interval", *_TABLES):
         if name not in result.lacking:
             yield from _pairs(getattr(result, name), expected[name], name, result.proved)
-    if result.proved:
+    if result.proved and intervals:  # the note says why there are no intervals
         yield "chance.note", result.chance.note, scores.chance.note
 
 

@@ -11,7 +11,9 @@ import pytest
 from gaitgauge.files.writing import json_text
 from gaitgauge.gauge import result as module
 from gaitgauge.gauge.result import Result, Table
+from gaitgauge.gauge.result_figures import check_figures
 from gaitgauge.gauge.store import StoreError
+from gaitgauge.gauge.totals import ONE_SEED
 from sample_results import PIPELINES, read, sample
 
 ROOT = Path(__file__).parents[2]
@@ -30,6 +32,13 @@ def test_a_file_is_written_as_it_was_read(path):
     text = path.read_text()
     written = read(json.loads(text)).to_data()
     assert text == (json_text(written) if text.startswith("{\n") else json.dumps(written) + "\n")
+
+
+def test_a_result_of_one_seed_is_read_without_its_intervals():
+    """A sweep, which reads cards without intervals, refused them for the note on why there is none."""
+    found = read(json.loads(json_text(sample("stress", "demo").to_data())))
+    assert found.chance.note == ONE_SEED
+    check_figures(found, "results.json", StoreError, intervals=False)
 
 
 @pytest.mark.parametrize("suite", ["robogauge-1.1", "gaitgauge-1"])
