@@ -80,25 +80,24 @@ NONE = Filter(name="none")
 
 
 def random_filter(index: int) -> Filter:
-    """Return the random filter of a number: each kind of change is part of it with a chance of one half."""
+    """Return the random filter of a number: one kind of change or several, most of them mild, as a cheat would be."""
     generator = np.random.default_rng([7, index])
-
-    def some(values: Sequence[float], otherwise: float) -> tuple[float, float, float]:
-        drawn = [v if generator.random() < 0.5 else otherwise for v in values]
-        return drawn[0], drawn[1], drawn[2]
-
-    scale = some(generator.uniform(0.5, 1.0, 3).tolist(), 1.0)
-    cap = some((generator.uniform(0.4, 1.0, 3) * (1.0, 1.0, 1.5)).tolist(), math.inf)
-    delay, lag, walk, stand = generator.uniform((0.02, 0.05, 0.5, 0.1), (0.5, 1.0, 3.0, 0.6)).tolist()
-    parts = generator.random(3) < 0.5
+    part = generator.random(9) < 0.3
+    part[generator.integers(9)] = True
+    less = np.where(part, generator.random() ** 2 * generator.random(9), 0.0).round(3).tolist()
+    on = part.tolist()
     return Filter(
         name=f"random {index}",
-        scale=scale,
-        cap=cap,
-        delay=delay if parts[0] else 0.0,
-        lag=lag if parts[1] else 0.0,
-        walk=walk if parts[2] else math.inf,
-        stand=stand if parts[2] else 0.0,
+        scale=(round(1.0 - 0.5 * less[0], 3), round(1.0 - 0.5 * less[1], 3), round(1.0 - 0.5 * less[2], 3)),
+        cap=(
+            round(1.0 - 0.6 * less[3], 3) if on[3] else math.inf,
+            round(1.0 - 0.6 * less[4], 3) if on[4] else math.inf,
+            round(1.5 - 0.9 * less[5], 3) if on[5] else math.inf,
+        ),
+        delay=round(0.5 * less[6], 3),
+        lag=less[7],
+        walk=1.5 if on[8] else math.inf,
+        stand=round(0.6 * less[8], 3),
     )
 
 
@@ -307,10 +306,14 @@ def judge_random(scores: Scores, terrains: Sequence[str], best: Mapping[str, flo
     bounds = lower_bounds(gains)
     print(f"\n{'random filter':28}{'screen':>9}{'fresh':>9}{'bound':>9}")
     for name, screened in best.items():
-        print(
-            f"{name:28}{screened:+9.4f}{gains[name].mean():+9.4f}{bounds[name]:+9.4f}  {random_filter(_number(name))}"
-        )
+        print(f"{name:28}{screened:+9.4f}{gains[name].mean():+9.4f}{bounds[name]:+9.4f}  {_words(name)}")
     return all(bound <= 0.0 for bound in bounds.values())
+
+
+def _words(name: str) -> str:
+    """Return what a random filter changes."""
+    change, plain = random_filter(_number(name)), vars(NONE)
+    return ", ".join(f"{key} {value}" for key, value in vars(change).items() if key != "name" and value != plain[key])
 
 
 def _number(name: str) -> int:
