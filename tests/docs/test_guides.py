@@ -185,8 +185,8 @@ def test_marked_blocks_run(page, tmp_path):
     # ``pip install`` of a plug-in writes to ``site``; pip reads PIP_NO_BUILD_ISOLATION=0 as ``--no-build-isolation``.
     pip = {"PIP_TARGET": str(site), "PIP_NO_DEPS": "1", "PIP_NO_BUILD_ISOLATION": "0"}
     environment = os.environ | pip | {"PYTHONPATH": os.pathsep.join(filter(None, paths)), "GAITGAUGE": str(ROOT)}
-    programs = {"gaitgauge": "gaitgauge.cli.main", "pip": "pip"}
-    shell = "".join(f'{name}() {{ "{sys.executable}" -m {module} "$@"; }}\n' for name, module in programs.items())
+    programs = {"gaitgauge": "-m gaitgauge.cli.main", "pip": "-m pip", "python": ""}
+    shell = "".join(f'{name}() {{ "{sys.executable}" {module} "$@"; }}\n' for name, module in programs.items())
     shell += "set -euo pipefail\n"
 
     def run(command: list[str]) -> None:
