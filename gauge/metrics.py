@@ -74,28 +74,6 @@ def angular_velocity(
     return 1.0 - torch.sqrt(rate[:, 0] ** 2 + rate[:, 1] ** 2 + yaw**2) / scale
 
 
-def command_share(
-    quaternion: torch.Tensor, velocity_w: torch.Tensor, rate_b: torch.Tensor, command: torch.Tensor
-) -> torch.Tensor:
-    """Return the speed in the commanded direction over the commanded speed: 1 where a command is met, 2 where a turn is twice as fast.
-
-    Args:
-        quaternion: base orientation wxyz, (N, 4).
-        velocity_w: base velocity, world frame [m/s], (N, 3).
-        rate_b: angular velocity in the body frame [rad/s], (N, 3).
-        command: as for ``linear_velocity``.
-
-    Returns:
-        (N,); NaN at rest and where a command walks and turns at once.
-    """
-    walk, turn = command[:, :2], command[:, 2]
-    walked = (rotate_inverse(quaternion, velocity_w)[:, :2] * walk).sum(1) / (walk**2).sum(1)
-    turned = rate_b[:, 2] / turn
-    walks, turns = (walk != 0.0).any(1), turn != 0.0
-    share = torch.where(walks, walked, turned)
-    return torch.where(walks ^ turns, share, torch.full_like(share, math.nan))
-
-
 def joint_limits(position: torch.Tensor, low: torch.Tensor, high: torch.Tensor, full: torch.Tensor) -> torch.Tensor:
     """Return 1 - RMS over joints of the overshoot outside [low, high] as a share of the full range (Dof Limits).
 
@@ -364,14 +342,6 @@ METRICS: Mapping[str, Metric] = {
         state=("base_quaternion_w", "base_angular_velocity_b"),
         label="angular velocity tracking",
         short_label="angular velocity",
-        group="tracking",
-    ),
-    "command_share": Metric(
-        function=lambda at: command_share(
-            at.state.base_quaternion_w, at.state.base_linear_velocity_w, at.state.base_angular_velocity_b, at.command
-        ),
-        state=("base_quaternion_w", "base_linear_velocity_w", "base_angular_velocity_b"),
-        label="share of the commanded speed",
         group="tracking",
     ),
     "dof_limits": Metric(

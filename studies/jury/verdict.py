@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...gauge.episodes import QUALITY, Episode, Record
+from ...gauge.episodes import MOTION, QUALITY, Episode, Record
 from ...gauge.goals import count_sub_commands
 from ...gauge.plan import Records
 from ...gauge.suite import Suite
@@ -27,7 +27,6 @@ OFF = 0.10
 """Deviation from a commanded speed that is marked."""
 HOME = 0.02
 """Advantage of an engine over the others that matters."""
-_SHARE = "command_share"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,7 +84,7 @@ def _segment(record: Record, goal: int, part: int) -> tuple[float, float, bool]:
     fell = (goal, part) in (record.fallen or ()) or record.diverged
     if len(mine) == 0:
         return 0.0, np.nan, fell
-    shares = mine[int(SETTLED * len(mine)) :, record.columns.index(_SHARE)]
+    shares = mine[int(SETTLED * len(mine)) :, record.columns.index(MOTION)]
     share = np.nan if fell or np.isnan(shares).all() else float(np.nanmean(shares))
     return float(np.clip(mine[:, record.columns.index(QUALITY)], 0.0, 1.0).mean()), share, fell
 

@@ -135,6 +135,8 @@ def test_the_share_of_a_motion_is_its_part_along_the_command():
     ask = torch.tensor([[1.0, 0.0, 0.0]])
     for velocity, expected in (((0.5, 0, 0), 0.5), ((1.0, 0.7, 1.0), 1.0), ((-0.2, 0, 0), -0.2), ((1.3, 0, 0), 1.3)):
         assert motion_done(torch.tensor([velocity]), ask, limits).item() == pytest.approx(expected)
+    turn = torch.tensor([[9.0, 9.0, -1.7]]), torch.tensor([[0.0, 0.0, -1.0]])
+    assert motion_done(*turn, limits).item() == pytest.approx(1.7)
     # as shares of the limits: 0.5 and 1 asked, 0.5 and 0.4 done, (0.25 + 0.4) / 1.25
     both = motion_done(torch.tensor([[1.0, 0.4, 0.0]]), torch.tensor([[1.0, 1.0, 0.0]]), limits)
     assert both.item() == pytest.approx(0.65 / 1.25)

@@ -158,6 +158,14 @@ def test_both_suites_evaluate_what_they_weigh():
     assert list(evaluate(OWN, state)) == [*six, "zmp_margin", "friction_margin", "motion_done", "quality"]
 
 
+def test_the_motion_that_is_done_is_taken_in_the_body_frame():
+    """Heading left (+90° about z), a robot that moves along world +y walks forward."""
+    state = fake(short_suite()).state
+    state.base_quaternion_w[:] = turned(yaw=90.0)
+    state.base_linear_velocity_w[:] = rows(0.0, 0.8, 0.0)
+    assert evaluate(OWN, state, (1.0, 0.0, 0.0))["motion_done"] == pytest.approx(0.8)
+
+
 @pytest.mark.parametrize(("share", "defined"), [(0.049, False), (0.051, True)])
 def test_contact_metrics_need_a_twentieth_of_the_weight(share, defined):
     state = fake(short_suite()).state

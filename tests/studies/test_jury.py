@@ -9,7 +9,6 @@ import pytest
 import torch
 from gaitgauge.backends import BackendError
 from gaitgauge.gauge.episodes import Record
-from gaitgauge.gauge.metrics import command_share
 from gaitgauge.gauge.suite import load_suite
 from gaitgauge.policy.contract import standard_contract
 from gaitgauge.policy.native import StoredNetwork, save_policy
@@ -83,24 +82,6 @@ def judged(request, folder, fast=1.5, fail=(), **options):
 
     with patch.object(variants, "make_backend", make):
         return judging.jury(request, folder, **options)
-
-
-def test_share_of_a_commanded_speed():
-    """Walking at 0.5 of 1 m/s is 0.5, turning at 1.7 of 1 rad/s 1.7; at rest and for mixed commands there is none."""
-    upright = torch.tensor([[1.0, 0.0, 0.0, 0.0]]).expand(5, -1)
-    velocity = torch.tensor([[0.5, 9.0, 0.0], [-0.3, 0.6, 0.0], [9.0, 9.0, 0.0], [1.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
-    rate = torch.tensor([[0.0, 0.0, 9.0], [0.0, 0.0, 9.0], [9.0, 9.0, -1.7], [0.0, 0.0, 1.0], [0.0, 0.0, 1.0]])
-    command = torch.tensor([[1.0, 0, 0], [-0.6, 1.2, 0], [0, 0, -1.0], [0, 0, 0], [1.0, 0, 1.0]])
-    share = command_share(upright, velocity, rate, command)
-    assert share[:3].tolist() == pytest.approx([0.5, 0.5, 1.7])
-    assert torch.isnan(share[3:]).all()
-
-
-def test_share_is_taken_in_the_body_frame():
-    """Heading left (+90° about z), a robot that moves along world +y walks forward."""
-    quaternion = torch.tensor([[0.5**0.5, 0.0, 0.0, 0.5**0.5]])
-    velocity, command = torch.tensor([[0.0, 0.8, 0.0]]), torch.tensor([[1.0, 0.0, 0.0]])
-    assert command_share(quaternion, velocity, torch.zeros(1, 3), command).item() == pytest.approx(0.8)
 
 
 def test_engines_that_differ_in_speed_are_told_apart(brief, tmp_path):
@@ -182,7 +163,7 @@ def made_records(bench, quality, share=1.0, seed=0):
         parts = np.repeat(np.arange(6), 10)
         samples = np.ones((60, len(COLUMNS)), np.float32)
         samples[:, -1] = quality + random.normal(0.0, 0.01, 6)[parts]
-        samples[:, COLUMNS.index("command_share")] = share
+        samples[:, COLUMNS.index("motion_done")] = share
         found[episode] = Record(
             episode=episode, columns=COLUMNS, samples=samples, goal_index=np.zeros(60, np.int16), part_index=parts.astype(np.int16)
         )  # fmt: skip
