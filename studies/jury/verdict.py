@@ -120,6 +120,7 @@ def verdict(
                 "physics_steps": sum(r.physics_steps for r in found[label].values()),
                 "diverged": sum(r.diverged for r in found[label].values()),
                 "overflowed": sum(r.overflowed for r in found[label].values()),
+                "metrics": _metric_means(bench, found[label]),
             }
             for label in found
         },
@@ -131,6 +132,23 @@ def verdict(
         "home": list(home),
         "advantages": _advantages(bench, segments, families, home, name),
     }
+
+
+def _metric_means(bench: Bench, records: Records) -> dict[str, float]:
+    """Return the mean of each weighted metric over episodes, then over cells; what follows a fall counts as the suite says."""
+    weights = bench.suite.metrics.weights
+    cells = []
+    for cell in bench.cells:
+        mine = [records[e] for e in episodes_of(cell, bench.suite, bench.seeds)]
+        cells.append([np.mean([_mean(r, name) for r in mine]) for name in weights])
+    return {name: float(value) for name, value in zip(weights, np.mean(cells, axis=0), strict=True)}
+
+
+def _mean(record: Record, name: str) -> float:
+    """Return the mean of a metric's samples, each within 0 and 1; samples without a value do not count."""
+    values = record.samples[:, record.columns.index(name)].astype(np.float64)
+    values = values[~np.isnan(values)]
+    return float(np.clip(values, 0.0, 1.0).mean()) if len(values) else 0.0
 
 
 def _advantages(

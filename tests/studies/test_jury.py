@@ -92,6 +92,8 @@ def test_engines_that_differ_in_speed_are_told_apart(brief, tmp_path):
     assert forward["off"] == ["fake@ls_iterations=7"]
     assert (block["lowest"], block["highest"]) == ("fake@ls_iterations=7", "fake")
     assert block["ratio"] < 1.0
+    fast, good = (block["engines"][e]["metrics"]["lin_vel_err"] for e in ("fake@ls_iterations=7", "fake"))
+    assert 0.0 <= fast < good <= 1.0
     assert any("disagree most" in sentence for sentence in block["sentences"])
     assert results == json.loads((tmp_path / "out" / "jury.json").read_text())
     assert "fake@ls_iterations=7" in write_page(tmp_path / "out").read_text()
