@@ -84,6 +84,19 @@ class JointParameters:
 
 
 @dataclass(frozen=True, kw_only=True)
+class HeldJoint:
+    """A joint that no policy drives: its motor holds it at an angle."""
+
+    name: str
+    position: float
+    """[rad]."""
+    stiffness: float
+    """[N·m/rad]."""
+    damping: float
+    """[N·m·s/rad]."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Robot:
     """A legged robot as data. Joint, foot and body orders given here hold in all packages."""
 
@@ -120,6 +133,10 @@ class Robot:
     foot_shapes: _Names | None = None
     """Collision geom of each foot; None where the geoms bear the feet's names."""
 
+    driven_joints: _Names | None = None
+    """Joints that a policy drives, in the order that policies use; the others are held at ``default_joint_position`` with the
+    gains of the parameter set. None for all of ``joint_names``."""
+
     @property
     def num_joints(self) -> int:
         """Return the number of actuated joints."""
@@ -129,3 +146,14 @@ class Robot:
     def foot_geoms(self) -> tuple[str, ...]:
         """Return the name of each foot's collision geom."""
         return self.foot_shapes or self.foot_names
+
+    @property
+    def held(self) -> tuple[HeldJoint, ...]:
+        """Return the joints that no policy drives, with pose and gains of ``default_parameters``, in the joints' order."""
+        driven, motors = self.driven_joints or self.joint_names, self.parameters[self.default_parameters]
+        rows = zip(self.joint_names, self.default_joint_position, motors.stiffness, motors.damping, strict=True)
+        return tuple(
+            HeldJoint(name=name, position=angle, stiffness=kp, damping=kd)
+            for name, angle, kp, kd in rows
+            if name not in driven
+        )

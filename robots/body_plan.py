@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .base import Robot
+from .limbs import joint_chain, pitch_joints
 from .loading import RobotError
 
 if TYPE_CHECKING:
@@ -56,7 +57,7 @@ class BodyPlan:
     stretched_height: float
     """Height of the base above level ground at which all legs hang straight down to it [m], the mean of all legs."""
     leg_length: float
-    """Length of a stretched leg [m]: the links from its first joint beside abduction to the foot, the mean of all legs."""
+    """Length of a stretched leg [m]: the links from the first joint that bends it to the foot, the mean of all legs."""
     mass: float
     """Of the whole robot [kg]."""
 
@@ -198,20 +199,10 @@ def default_pose(robot: Robot) -> tuple[mujoco.MjModel, mujoco.MjData]:
     return model, data
 
 
-def joint_chain(model: mujoco.MjModel, body: int, base: int) -> list[int]:
-    """Return the joints that move a body against the base, from the base outwards."""
-    joints: list[int] = []
-    while body not in (base, 0):
-        first = int(model.body_jntadr[body])
-        joints = [first + i for i in range(model.body_jntnum[body])] + joints
-        body = int(model.body_parentid[body])
-    return joints
-
-
 def sideways_and_swinging(data: mujoco.MjData, chain: Sequence[int]) -> tuple[int | None, list[int]]:
-    """Return a leg's first joint that turns mainly about the x axis, None without one, and the others, or all if none is left."""
+    """Return a leg's first joint that turns mainly about the x axis, None without one, and the joints that bend the leg."""
     sideways = next((j for j in chain if int(np.abs(data.xaxis[j]).argmax()) == 0), None)
-    return sideways, [j for j in chain if j != sideways] or list(chain)
+    return sideways, pitch_joints(data, chain)
 
 
 def stretched_length(data: mujoco.MjData, joints: list[int], foot: int) -> float:

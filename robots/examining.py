@@ -14,9 +14,10 @@ import numpy as np
 from ..files.parsing import build, parse_json
 from .apart import run_apart
 from .base import JointParameters, Robot
-from .body_plan import body_plan, default_pose, joint_chain, joint_ranges, lowest_point, mirror_image
+from .body_plan import body_plan, default_pose, joint_ranges, lowest_point, mirror_image
 from .checking import DEPTH_TOLERANCE, ModelChecks
 from .feet import shank_end
+from .limbs import joint_chain
 from .loading import RobotError
 
 if TYPE_CHECKING:

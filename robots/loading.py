@@ -36,7 +36,7 @@ _JOINT_ENDING = "_joint"
 PER_JOINT = tuple(f.name for f in fields(JointParameters) if f.name not in ("delay", "motor", "network", "measured"))
 """Fields of a parameter set with a value for each joint."""
 _MEASURED = ("stiffness_factor", "damping_factor", "target_offset", "delay", "network", "measured")
-_ADDED_LATER = ("foot_shapes", "action_scale", "imu_site")
+_ADDED_LATER = ("foot_shapes", "action_scale", "imu_site", "driven_joints")
 """Fields that count for a robot's digest only where set, so that digests of older descriptions stay."""
 
 
@@ -282,7 +282,7 @@ def _check(robot: Robot, source: str) -> None:
     if not os.path.isfile(robot.mjcf):  # False for an impossible name, too
         lost = f"mjcf names '{one_line(robot.mjcf)}', which does not exist"
         raise RobotError(f"{source}: {lost}; the path is relative to the robot file")
-    for key in ("joint_names", "foot_names", "collision_bodies", "trunk_shapes", "foot_shapes"):
+    for key in ("joint_names", "foot_names", "collision_bodies", "trunk_shapes", "foot_shapes", "driven_joints"):
         names = getattr(robot, key) or ()
         twice = [n for n in names if names.count(n) > 1]
         if twice:
@@ -304,6 +304,10 @@ def _check(robot: Robot, source: str) -> None:
         odd = next((n for n in robot.sdk_joint_names if n not in robot.joint_names), None)
         problem = f"names {shown(odd)}, which is none of joint_names" if odd else "does not name each joint once"
         raise RobotError(f"{source}: sdk_joint_names {problem}; give every joint once, in the SDK's order of motors")
+    for name in robot.driven_joints or ():
+        if name not in robot.joint_names:
+            hint = did_you_mean(name, robot.joint_names)
+            raise RobotError(f"{source}: driven_joints names {shown(name)}, which is none of joint_names{hint}")
     if robot.default_parameters not in robot.parameters:
         known = ", ".join(robot.parameters)
         raise RobotError(f"{source}: default_parameters is {shown(robot.default_parameters)}; choose from: {known}")

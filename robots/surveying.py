@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..files.parsing import one_line
-from .body_plan import joint_chain, lowest_point, sideways_and_swinging, stretched_length
+from .body_plan import lowest_point, sideways_and_swinging, stretched_length
 from .checking import solid
 from .feet import add_foot, shank_end
+from .limbs import joint_chain
 from .loading import RobotError
 
 if TYPE_CHECKING:
