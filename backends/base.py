@@ -305,6 +305,8 @@ class PhysicsBackend(ABC):
     parallel_processes: ClassVar[bool] = False
     """True for an engine on the CPU that plays faster as one process a core than as one process with threads. Several processes may
     then build worlds at the same time, here and on a cluster; results may not depend on their number."""
+    velocity_targets: ClassVar[bool] = False
+    """True where a target of ``Robot.velocity_joints`` is a velocity; ``make_backend`` refuses such robots else."""
     torque_motors: ClassVar[bool] = False
     """True for an engine that knows ``motor = "torque"``: a joint's target is its motor's torque [N·m], before limits and
     strength. Motors by network need it."""

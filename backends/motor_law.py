@@ -1,6 +1,7 @@
 """The motor law for engines that compute it in NumPy or torch; ``warp.motors.motor_torque`` is the same law for kernels.
 
-Torque = kp (target + offset − q) − kd q̇, clipped to limits, then multiplied by the motor strength. With
+Torque = kp (target + offset − q) − kd q̇, clipped to limits, then multiplied by the motor strength. Joints of
+``Robot.velocity_joints`` have targets of velocity: kd (target − q̇), clipped and multiplied alike. With
 ``PhysicsOptions.torque_speed_limit`` the limits follow the joint's speed: in the direction of motion a motor gives its
 driving torque up to the speed of full torque, from there a torque that falls linearly to zero at the no-load speed;
 against the motion it keeps its whole torque at any speed. A joint at rest counts as driven. ``Randomization.motor_speed``

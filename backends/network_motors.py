@@ -108,6 +108,11 @@ class NetworkMotors(PhysicsBackend):
             MotorNetworkError: the network's file cannot be used.
         """
         assert engine is not None and scene.parameters.network is not None
+        if scene.robot.velocity_joints:
+            raise BackendError(
+                f"motors by network take targets of position, and robot '{scene.robot.name}' has velocity_joints; choose "
+                "another set with --parameters"
+            )
         network = load_motor_network(scene.parameters.network)
         physics = scene.physics
         pieces, periods = network.period / physics.timestep, physics.control_period / network.period

@@ -214,6 +214,11 @@ def make_backend(name: str, scene: Scene, *, device: str = "cpu", threads: int =
     """
     found, plugin = engine_class(name), plugins(GROUP).get(name.partition(":")[0])
     build: Callable[[], PhysicsBackend] = partial(found, scene, device=device, threads=threads)
+    if scene.robot.velocity_joints and not found.velocity_targets:
+        raise BackendError(
+            f"engine '{name}' has no targets of velocity, which {', '.join(scene.robot.velocity_joints)} of robot "
+            f"'{scene.robot.name}' need; choose another --backend"
+        )
     if scene.parameters.motor == "network":
         from .network_motors import NetworkMotors
 

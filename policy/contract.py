@@ -42,7 +42,8 @@ class ContractError(ValueError):
 _MOST = 1000
 """Joints."""
 _LATER = frozenset(
-    {"action_offset", "layout", "memory", "encoder"} | {"reference", "values", "period", "offsets", "waves", "at_rest"}
+    {"action_offset", "layout", "memory", "encoder", "velocity_joints"}
+    | {"reference", "values", "period", "offsets", "waves", "at_rest"}
 )
 """Fields that hashes of older contracts lack."""
 REPEATABLE = ("gait_phase", "constant")
@@ -174,13 +175,14 @@ class PolicyContract:
     default_joint_position: Annotated[tuple[Angle, ...], Field(min_length=1, max_length=_MOST)]
     """[rad], in the policy's joint order."""
     action_scale: Annotated[tuple[_ActionScale, ...], Field(min_length=1, max_length=_MOST)]
-    """[rad] per unit of network output, per joint; negative where the network's joint turns the other way."""
+    """[rad] per unit of network output, per joint, [rad/s] for velocity_joints; negative where the network's joint turns the other
+    way."""
     action_offset: Annotated[tuple[Angle, ...], Field(min_length=1, max_length=_MOST)] | None = None
     """Joint target at an action of zero [rad], None for the default pose."""
     action_clip: _Clip | None = None
     """Largest magnitude of the network's output, for targets and ``last_action`` alike; None for no clipping."""
     target_range: tuple[tuple[_Target, _Target], ...] | None = None
-    """Lowest and highest joint target per joint [rad], None for no limit."""
+    """Lowest and highest joint target per joint [rad, rad/s], None for no limit."""
     stiffness: Annotated[tuple[Stiffness, ...], Field(min_length=1, max_length=_MOST)]
     """Motor kp the policy was made for [N·m/rad]."""
     damping: Annotated[tuple[Damping, ...], Field(min_length=1, max_length=_MOST)]
@@ -198,6 +200,8 @@ class PolicyContract:
     """Largest forward, lateral [m/s] and yaw [rad/s] command the policy was made for."""
     provenance: Mapping[str, Any] = field(default_factory=dict)
     """Origin of the policy (training run, file, adapter); not part of the hash."""
+    velocity_joints: tuple[Text, ...] = ()
+    """Joints with targets of velocity [rad/s] instead of angle, as wheels have: torque = damping · (target − speed)."""
     schema_version: Literal[1] = SCHEMA_VERSION
 
     def __post_init__(self) -> None:
@@ -209,6 +213,13 @@ class PolicyContract:
             entries = getattr(self, name)
             if entries is not None and len(entries) != joints:
                 raise ContractError(f"contract: {name} has {len(entries)} entries; {joints} are needed")
+        for joint in self.velocity_joints:
+            if joint not in names:
+                raise ContractError(f"contract: velocity_joints names {shown(joint)}, which is none of joint_names")
+            if angle := self.default_joint_position[names.index(joint)]:
+                raise ContractError(
+                    f"contract: default_joint_position of {shown(joint)} is {angle:g}; of velocity_joints it is 0"
+                )
         for joint, (low, high) in zip(names, self.target_range or (), strict=False):
             if low > high:
                 raise ContractError(
@@ -344,6 +355,12 @@ def check_robot(contract: PolicyContract, robot: Robot) -> tuple[int, ...]:
             f"the policy's joints are not those of robot '{robot.name}': "
             f"the policy has {', '.join(contract.joint_names)}; the robot has {', '.join(robot.joint_names)}"
         )
+    if set(contract.velocity_joints) != (wheels := set(robot.velocity_joints or ())):
+        ours, theirs = (", ".join(sorted(names)) or "no joint" for names in (contract.velocity_joints, wheels))
+        raise ContractError(
+            f"the policy gives targets of velocity to {ours}, robot '{robot.name}' takes them for {theirs}; mend velocity_joints of "
+            "the policy's contract"
+        )
     return tuple(robot.joint_names.index(n) for n in contract.joint_names)
 
 
@@ -403,13 +420,17 @@ def standard_contract(
     """Return the interface that the CTS family of policies for the Unitree Go2 shares (paper, section on observations).
 
     Angular velocity, gravity, command, joint positions, joint velocities and the last action make 45 entries; an action
-    moves the target around the standing pose by the robot's action scale, 0.25 rad per unit for the Go2, every 0.02 s.
+    moves the target around the standing pose by the robot's action scale, 0.25 rad per unit for the Go2, every 0.02 s. Angles
+    of wheels stay out of the observation.
 
     Args:
         robot: gives the joints, the standing pose, the gains and the command limits.
         history: frames in the network's input, None for the current one alone.
     """
     motors = robot.parameters[robot.default_parameters]
+    scales = {name: OBSERVATIONS[name].scale for name in STANDARD}
+    if robot.velocity_joints:
+        scales["joint_position"] = without_wheels(scales["joint_position"], robot.driven_by_velocity)
     return PolicyContract(
         robot=robot.name,
         joint_names=robot.joint_names,
@@ -418,8 +439,16 @@ def standard_contract(
         stiffness=motors.stiffness,
         damping=motors.damping,
         control_period=0.02,
-        observation=tuple(ObservationTerm(name=name, scale=OBSERVATIONS[name].scale) for name in STANDARD),
+        observation=tuple(ObservationTerm(name=name, scale=scale) for name, scale in scales.items()),
         history=history or History(),
         command_limits=robot.command_limits,
+        velocity_joints=robot.velocity_joints or (),
         provenance=provenance or {},
+    )
+
+
+def without_wheels(scale: Sequence[float], wheels: Sequence[bool]) -> tuple[float, ...]:
+    """Return the factor on each joint's angle, zero for those that are wheels: the angle of a wheel says nothing."""
+    return tuple(
+        0.0 if wheel else one for one, wheel in zip(tuple(scale) * (len(wheels) // len(scale)), wheels, strict=True)
     )

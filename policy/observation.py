@@ -174,7 +174,7 @@ class ObservationBuilder:
         return self._in_order(frames.flatten(1))
 
     def targets(self, action: torch.Tensor) -> torch.Tensor:
-        """Return joint targets [rad], in the robot's order, of raw actions in the policy's order, both (N, J). NaN stays NaN."""
+        """Return joint targets [rad, rad/s], in the robot's order, of raw actions in the policy's order, both (N, J). NaN stays NaN."""
         if self.contract.action_clip is not None:
             action = torch.clamp(action, -self.contract.action_clip, self.contract.action_clip)
         target = self._offset + self._action_scale * action

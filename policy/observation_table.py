@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from ..backends.base import PhysicsState
 
 GROUP = "gaitgauge.observations"
+WITHOUT_WHEELS = "joint_pos_rel_without_wheel"
+"""robot_lab's angles of joints, those of wheels being zero."""
 _WIDEST = 1000
 
 
@@ -179,7 +181,7 @@ _OWN = (
         unit="rad",
         noise="joint_position",
         mirror="joints",
-        foreign_names=("joint_pos_rel", "joint_pos"),
+        foreign_names=("joint_pos_rel", "joint_pos", WITHOUT_WHEELS),
         about_default_pose=True,
     ),
     Observation(

@@ -34,10 +34,11 @@ _Names = Annotated[tuple[Text, ...], Field(min_length=1, max_length=1000)]
 class JointParameters:
     """One named set of joint and motor constants. Every tuple has one entry per joint, in the robot's joint order.
 
-    The motor law is ``torque = stiffness * (target - q) - damping * qd``, clipped to ``torque_limit`` where the physics
-    options ask for torque limits, then multiplied by the motor strength. Where they ask for limits by speed, the torque
-    in the direction of motion falls from ``driving_torque_limit`` at ``full_torque_speed`` to zero at ``no_load_speed``.
-    ``commanded`` turns gains that were sent to a measured robot into those that act.
+    The motor law is ``torque = stiffness * (target - q) - damping * qd``, for a joint of ``Robot.velocity_joints``
+    ``damping * (target - qd)``, clipped to ``torque_limit`` where the physics options ask for torque limits, then
+    multiplied by the motor strength. Where they ask for limits by speed, the torque in the direction of motion falls from
+    ``driving_torque_limit`` at ``full_torque_speed`` to zero at ``no_load_speed``. ``commanded`` turns gains that were
+    sent to a measured robot into those that act.
     """
 
     stiffness: tuple[Stiffness, ...]
@@ -129,9 +130,11 @@ class Robot:
     sdk_joint_names: _Names | None = None
     """Joints in the motor order of the maker's SDK, which a ``deploy.yaml`` refers to; None where it is not known."""
     action_scale: Annotated[tuple[_ActionScale, ...], Field(min_length=1)] | None = None
-    """Change of a joint's target for an output of 1 of a standard policy [rad]; None for 0.25."""
+    """Change of a joint's target for an output of 1 of a standard policy [rad; rad/s]; None for 0.25."""
     foot_shapes: _Names | None = None
     """Collision geom of each foot; None where the geoms bear the feet's names."""
+    velocity_joints: _Names | None = None
+    """Joints with targets of velocity [rad/s] instead of angle, as wheels have; None for none."""
 
     driven_joints: _Names | None = None
     """Joints that a policy drives, in the order that policies use; the others are held at ``default_joint_position`` with the
@@ -141,6 +144,11 @@ class Robot:
     def num_joints(self) -> int:
         """Return the number of actuated joints."""
         return len(self.joint_names)
+
+    @property
+    def driven_by_velocity(self) -> tuple[bool, ...]:
+        """Return, for each joint, whether its target is a velocity."""
+        return tuple(name in (self.velocity_joints or ()) for name in self.joint_names)
 
     @property
     def foot_geoms(self) -> tuple[str, ...]:

@@ -45,7 +45,7 @@ class BodyPlan:
     """A robot's legs and sizes."""
 
     legs: tuple[tuple[int, ...], ...]
-    """Joints of each foot's leg from the base outwards, indices in the robot's joint order."""
+    """Joints of each foot's leg from the base outwards, without wheels, indices in the robot's joint order."""
     abduction: tuple[int, ...]
     """Joint of each leg that swings it sideways, the first about the x axis; legs without one are left out."""
     limb_bodies: tuple[int, ...]
@@ -79,11 +79,13 @@ def body_plan(robot: Robot) -> BodyPlan:
     """Read legs and sizes off a robot's model; raise ``RobotError`` where joints of ``joint_names`` do not move a foot."""
     model, data = default_pose(robot)
     order = {model.joint(name).id: i for i, name in enumerate(robot.joint_names)}
+    wheels = {model.joint(name).id for name in robot.velocity_joints or ()}
     base = model.body(robot.base_body).id
     feet = [model.geom(name).id for name in robot.foot_geoms]
     legs, abduction, lengths, below = [], [], [], []
     for name, foot in zip(robot.foot_names, feet, strict=True):
         chain = joint_chain(model, int(model.geom_bodyid[foot]), base)
+        chain = [j for j in chain if j not in wheels]
         if not chain or any(j not in order for j in chain):
             raise RobotError(f"robot '{robot.name}': the foot '{name}' is not moved by joints of joint_names")
         legs.append(tuple(order[j] for j in chain))
@@ -212,11 +214,14 @@ def stretched_length(data: mujoco.MjData, joints: list[int], foot: int) -> float
 
 
 def lowest_point(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> float:
-    """Return the height of a geom's lowest point, or that of its bounding box for other shapes than spheres [m]."""
+    """Return the height of a geom's lowest point, or that of its bounding box for other shapes than spheres and cylinders [m]."""
     import mujoco
 
     if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_SPHERE:
         return float(data.geom_xpos[geom, 2] - model.geom_size[geom, 0])
     center, half = model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]
     up = data.geom_xmat[geom].reshape(3, 3)[2]
+    if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_CYLINDER:
+        radius, length = model.geom_size[geom, :2]
+        return float(data.geom_xpos[geom, 2] - radius * np.hypot(up[0], up[1]) - length * abs(up[2]))
     return float(data.geom_xpos[geom, 2] + up @ center - np.abs(up) @ half)

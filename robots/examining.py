@@ -229,11 +229,11 @@ def _mirror(robot: Robot) -> str:
 
 
 def _ranges(robot: Robot) -> str:
-    ranges = zip(robot.joint_names, joint_ranges(robot), strict=True)
-    free = [name for name, bounds in ranges if not np.isfinite(bounds).all()]
+    ranges = zip(robot.joint_names, robot.driven_by_velocity, joint_ranges(robot), strict=True)
+    free = [name for name, wheel, bounds in ranges if not wheel and not np.isfinite(bounds).all()]
     if free:
         raise RobotError(f"{len(free)} joints have no range in the model ('{free[0]}' …); give them one")
-    return "every joint has a range"
+    return "every joint with a target of angle has a range"
 
 
 def damped_share(robot: Robot, motors: JointParameters) -> float:

@@ -36,7 +36,7 @@ _JOINT_ENDING = "_joint"
 PER_JOINT = tuple(f.name for f in fields(JointParameters) if f.name not in ("delay", "motor", "network", "measured"))
 """Fields of a parameter set with a value for each joint."""
 _MEASURED = ("stiffness_factor", "damping_factor", "target_offset", "delay", "network", "measured")
-_ADDED_LATER = ("foot_shapes", "action_scale", "imu_site", "driven_joints")
+_ADDED_LATER = ("foot_shapes", "action_scale", "imu_site", "driven_joints", "velocity_joints")
 """Fields that count for a robot's digest only where set, so that digests of older descriptions stay."""
 
 
@@ -282,7 +282,8 @@ def _check(robot: Robot, source: str) -> None:
     if not os.path.isfile(robot.mjcf):  # False for an impossible name, too
         lost = f"mjcf names '{one_line(robot.mjcf)}', which does not exist"
         raise RobotError(f"{source}: {lost}; the path is relative to the robot file")
-    for key in ("joint_names", "foot_names", "collision_bodies", "trunk_shapes", "foot_shapes", "driven_joints"):
+    lists = ("joint_names", "foot_names", "collision_bodies", "trunk_shapes", "foot_shapes")
+    for key in (*lists, "driven_joints", "velocity_joints"):
         names = getattr(robot, key) or ()
         twice = [n for n in names if names.count(n) > 1]
         if twice:
@@ -290,6 +291,8 @@ def _check(robot: Robot, source: str) -> None:
     if robot.foot_shapes and len(robot.foot_shapes) != len(robot.foot_names):
         counts = f"foot_shapes has {len(robot.foot_shapes)} names but foot_names has {len(robot.foot_names)}"
         raise RobotError(f"{source}: {counts}; give one for each foot")
+    if strange := [n for n in robot.velocity_joints or () if n not in robot.joint_names]:
+        raise RobotError(f"{source}: velocity_joints names {shown(strange[0])}, which is none of joint_names")
     per_joint: dict[str, tuple[float, ...]] = {"default_joint_position": robot.default_joint_position}
     if robot.action_scale is not None:
         per_joint["action_scale"] = robot.action_scale
@@ -298,6 +301,13 @@ def _check(robot: Robot, source: str) -> None:
     for key, values in per_joint.items():
         if len(values) != robot.num_joints:
             raise RobotError(f"{source}: {key} has {len(values)} values but there are {robot.num_joints} joints")
+    for name, driven, angle in zip(
+        robot.joint_names, robot.driven_by_velocity, robot.default_joint_position, strict=True
+    ):
+        if driven and angle:
+            raise RobotError(
+                f"{source}: default_joint_position of {shown(name)} is {angle:g}; of velocity_joints it is 0"
+            )
     for name, constants in robot.parameters.items():
         _check_motors(constants, robot.joint_names, f"{source}: parameters.{name}.")
     if robot.sdk_joint_names and sorted(robot.sdk_joint_names) != sorted(robot.joint_names):

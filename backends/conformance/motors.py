@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from .bench import Bench, Worlds, expect, expect_close
+from ...robots.body_plan import body_plan
+from .bench import WORLDS, Bench, Worlds, expect, expect_close
 from .check import check
 from .kinematics import follow_reference, posed
 
@@ -169,6 +170,49 @@ def torque_motor(bench: Bench) -> str:
         wanted = told.clip(-16.0, 16.0) * strength
         expect_close("joint_torque of torque motors [N·m]", worlds.read().joint_torque, wanted, 2e-3)
     return ""
+
+
+@check("motors/velocity", "torque_limits", "motor_strength", "gains", "motor_offset", "latency")
+def velocity_targets(bench: Bench) -> str:
+    """Joints with targets of velocity follow kd (target − q̇) with factors, limits, strength and latency; others keep their law."""
+    calves = tuple(leg[-1] for leg in body_plan(bench.robot).legs)
+    names = tuple(bench.robot.joint_names[j] for j in calves)
+    wheeled = replace(bench, robot=replace(bench.robot, velocity_joints=names))
+    random, shape = np.random.default_rng(13), (WORLDS, bench.robot.num_joints)
+    stiffness, damping, strength = random.uniform(0.5, 1.5, (3, *shape))
+    with bench.worlds() as plain:
+        if not plain.backend.velocity_targets:
+            return "no such targets"
+    with wheeled.worlds(bench.soft(torque_limit=16.0, damping=1.0), torque_limits=True) as worlds:
+        worlds.randomize(
+            stiffness_scale=stiffness, damping_scale=damping, motor_strength=strength, motor_offset=np.full(shape, 0.05)
+        )
+        asked = posed(bench, worlds.count, seed=13)
+        first, then = asked["joint_position"] + random.uniform(-0.3, 0.3, (2, *shape))
+        first[:, calves], then[:, calves] = random.uniform(-30.0, 30.0, (2, WORLDS, len(calves)))
+        worlds.reset(**asked, held_target=first)
+        for target, late in ((first, 1), (then, 0)):
+            before = worlds.read()
+            worlds.step(then, delay=[late] * worlds.count, substeps=1)
+            kp = stiffness * np.asarray(bench.soft().stiffness)
+            wanted = kp * (target + 0.05 - before.joint_position) - damping * before.joint_velocity
+            wanted[:, calves] = (damping * (target - before.joint_velocity))[:, calves]
+            wanted = wanted.clip(-16.0, 16.0) * strength
+            expect(
+                (np.abs(wanted[:, calves]) == 16.0 * strength[:, calves]).any(), "the check's targets reach no limit"
+            )
+            expect_close("joint_torque [N·m]", worlds.read().joint_torque, wanted, 2e-3 + 1e-3 * np.abs(wanted))
+    with wheeled.worlds(bench.soft(torque_limit=1000.0)) as worlds:
+        asked = {k: v for k, v in posed(bench, WORLDS, seed=14).items() if k in ("base_position", "base_quaternion")}
+        target = worlds.default_pose.copy()
+        target[:, calves] = np.array([0.5, -0.5, 1.0, -1.0])[:, None]
+        worlds.reset(**asked)
+        worlds.step(target)
+        worlds.run(0.08)
+        error = follow_reference(
+            wheeled, worlds, asked, worlds.read(), seconds=0.1, target=target, angle=0.01, position=0.003
+        )
+    return f"0.1 s with targets of up to 1 rad/s: {error}"
 
 
 @check("motors/limp_and_held")

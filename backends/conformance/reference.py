@@ -109,7 +109,8 @@ class Reference:
         for _ in range(substeps):
             if target is not None:
                 q, qd = self.data.qpos[self.at_position], self.data.qvel[self.at_velocity]
-                self.torque = kp * (np.asarray(target) - q) - kd * qd
+                by_velocity = np.array(self.robot.driven_by_velocity)
+                self.torque = np.where(by_velocity, kd * np.asarray(target), kp * (np.asarray(target) - q)) - kd * qd
             else:
                 self.torque = np.zeros(self.robot.num_joints)
             self.data.qfrc_applied[self.at_velocity] = self.torque

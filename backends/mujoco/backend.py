@@ -50,6 +50,7 @@ class MujocoBackend(PhysicsBackend):
     """MuJoCo (C engine) on the CPU. Results do not depend on the number of threads nor on the other worlds."""
 
     torque_motors: ClassVar[bool] = True
+    velocity_targets: ClassVar[bool] = True
     name: ClassVar[str] = "mujoco"
     family: ClassVar[str] = "MuJoCo"
     parallel_processes: ClassVar[bool] = True
@@ -70,6 +71,7 @@ class MujocoBackend(PhysicsBackend):
         self.dtype = torch.float64
         n, joints = scene.num_worlds, scene.robot.num_joints
         self._limits, self._direct = MotorLimits.of(scene), scene.parameters.motor == "torque"
+        self._by_velocity = np.array(scene.robot.driven_by_velocity)
         self._palette = build_models(scene)
         self._terrain = np.asarray(scene.terrain_index, dtype=np.int64)
         nominal = self._palette[0]
@@ -275,7 +277,8 @@ class MujocoBackend(PhysicsBackend):
         parts = []
         for substep in range(control.shape[1]):
             position, velocity = self._qpos[np.ix_(rows, self._joint_q)], self._qvel[np.ix_(rows, self._joint_v)]
-            free = 0.0 if self._direct else position + self._kd_over_kp[rows] * velocity
+            turned = np.where(self._by_velocity, 0.0, position)
+            free = 0.0 if self._direct else turned + self._kd_over_kp[rows] * velocity
             target = control[:, substep]
             if self._limits.by_speed:
                 gain, strength = self._gain[rows], self._strength[rows]
@@ -368,12 +371,14 @@ class MujocoBackend(PhysicsBackend):
             mujoco.mj_setConst(model, mujoco.MjData(model))
         ones = np.ones(self.scene.robot.num_joints)
         strength = values.get("motor_strength", ones)
-        model.actuator_gainprm[:, 0] = nominal.actuator_gainprm[:, 0] * values.get("stiffness_scale", ones) * strength
-        model.actuator_biasprm[:, 1] = 0.0 if self._direct else -model.actuator_gainprm[:, 0]
-        model.actuator_biasprm[:, 2] = nominal.actuator_biasprm[:, 2] * values.get("damping_scale", ones) * strength
+        kp_scale, kd_scale = values.get("stiffness_scale", ones), values.get("damping_scale", ones)
+        scale = np.where(self._by_velocity, kd_scale, kp_scale)
+        model.actuator_gainprm[:, 0] = nominal.actuator_gainprm[:, 0] * scale * strength
+        model.actuator_biasprm[:, 1] = np.where(self._by_velocity | self._direct, 0.0, -model.actuator_gainprm[:, 0])
+        model.actuator_biasprm[:, 2] = nominal.actuator_biasprm[:, 2] * kd_scale * strength
         model.actuator_forcerange[:] = nominal.actuator_forcerange * strength[:, None]
         self._speed[row] = values.get("motor_speed", 1.0)
-        self._offset[row] = values.get("motor_offset", 0.0)
+        self._offset[row] = np.where(self._by_velocity, 0.0, values.get("motor_offset", 0.0))
 
     def _read_gains(self, rows: Sequence[int] | NDArray[np.int64]) -> None:
         """Read kp and strength of each motor, and kd/kp, from which the torque-free target follows."""

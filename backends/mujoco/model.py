@@ -82,8 +82,9 @@ def _set_motors(spec: mujoco.MjSpec, scene: Scene) -> None:
         motor.trntype = mujoco.mjtTrn.mjTRN_JOINT
         motor.gaintype = mujoco.mjtGain.mjGAIN_FIXED
         motor.biastype = mujoco.mjtBias.mjBIAS_AFFINE
-        motor.gainprm[0] = 1.0 if direct else kp
-        motor.biasprm[:3] = (0.0, 0.0, 0.0) if direct else (0.0, -kp, -kd)
+        by_velocity = name in (scene.robot.velocity_joints or ())
+        motor.gainprm[0] = 1.0 if direct else kd if by_velocity else kp
+        motor.biasprm[:3] = (0.0, 0.0, 0.0) if direct else (0.0, 0.0 if by_velocity else -kp, -kd)
         motor.ctrllimited = mujoco.mjtLimited.mjLIMITED_FALSE
         if scene.physics.torque_limits:
             motor.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
@@ -205,7 +206,7 @@ def describe_model(model: mujoco.MjModel, robot: Robot) -> dict[str, list[float]
         joint_armature=model.dof_armature[dofs],
         joint_damping=model.dof_damping[dofs],
         joint_friction_loss=model.dof_frictionloss[dofs],
-        stiffness=model.actuator_gainprm[:, 0],
+        stiffness=np.where(robot.driven_by_velocity, 0.0, model.actuator_gainprm[:, 0]),
         damping=-model.actuator_biasprm[:, 2],
         torque_limit=np.where(model.actuator_forcelimited > 0, model.actuator_forcerange[:, 1], np.inf),
         foot_friction=model.geom_friction[feet, 0],

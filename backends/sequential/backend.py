@@ -52,6 +52,7 @@ class SequentialBackend(PhysicsBackend):
     """
 
     torque_motors: ClassVar[bool] = True
+    velocity_targets: ClassVar[bool] = True
     parallel_processes: ClassVar[bool] = True
     precision: ClassVar[torch.dtype] = torch.float64
     """Floating-point type of the engine."""
@@ -77,6 +78,7 @@ class SequentialBackend(PhysicsBackend):
         self.robot: RobotModel = read_robot(scene)
         self._kp, self._kd = np.asarray(scene.parameters.stiffness), np.asarray(scene.parameters.damping)
         self._limits, self._direct = MotorLimits.of(scene), scene.parameters.motor == "torque"
+        self._by_velocity = np.array(scene.robot.driven_by_velocity)
         self._dry = np.zeros(joints) if self.own_dry_friction else np.asarray(scene.parameters.friction_loss)
         self._motors = {name: np.full((n, joints), float(name != "motor_offset")) for name in _MOTOR_FIELDS}
         self._changes: list[dict[str, Array]] = [{} for _ in range(n)]
@@ -230,11 +232,17 @@ class SequentialBackend(PhysicsBackend):
         torque = np.zeros(len(position))
         if not self._limp[row]:
             factors = {name: values[row] for name, values in self._motors.items()}
+            target, kp, kd = (
+                self._target[row],
+                self._kp * factors["stiffness_scale"],
+                self._kd * factors["damping_scale"],
+            )
+            as_is = self._by_velocity | self._direct
             torque = motor_torque(
-                self._target[row] if self._direct else self._target[row] + factors["motor_offset"] - position,
+                np.where(as_is, target, target + factors["motor_offset"] - position),
                 velocity,
-                stiffness=1.0 if self._direct else self._kp * factors["stiffness_scale"],
-                damping=0.0 if self._direct else self._kd * factors["damping_scale"],
+                stiffness=1.0 if self._direct else np.where(self._by_velocity, kd, kp),
+                damping=0.0 if self._direct else kd,
                 strength=factors["motor_strength"],
                 speed=factors["motor_speed"],
                 limits=self._limits,

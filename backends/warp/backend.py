@@ -27,6 +27,7 @@ class WarpBackend(PhysicsBackend):
     """N worlds on Warp. An engine adds its model and kernels."""
 
     torque_motors: ClassVar[bool] = True
+    velocity_targets: ClassVar[bool] = True
     always_masked: ClassVar[bool] = False
     """True where every control period puts aside worlds that must not step, so that one graph serves all masks."""
 

@@ -25,6 +25,8 @@ class Motors:
     """Limits as in ``MotorLimits``, (J,)."""
     direct: int
     """1 where a target is the torque itself."""
+    by_velocity: wp.array[int]
+    """1 where a target is a velocity, (J,)."""
     stiffness: wp.array2d[float]
     damping: wp.array2d[float]
     strength: wp.array2d[float]
@@ -67,6 +69,8 @@ class MotorTensors:
         """Number of substeps of the previous target, (N,)."""
         self.arrays = arrays = Motors()
         arrays.direct = int(scene.parameters.motor == "torque")
+        self._by_velocity = torch.tensor(scene.robot.driven_by_velocity, dtype=torch.int32, device=device)
+        arrays.by_velocity = wp.from_torch(self._by_velocity)
         for name in ("torque_limit", "stiffness", "damping", "strength", "speed", "offset", "requested", "delay"):
             setattr(arrays, name, wp.from_torch(getattr(self, name)))
         self._limits = [tensor(getattr(limits, name)) for name in ("driving", "no_load_speed", "fall")]
@@ -133,6 +137,8 @@ def motor_torque(motors: Motors, world: int, joint: int, substep: int, position:
         return 0.0
     error = target + motors.offset[world, joint] - position
     torque = motors.stiffness[world, joint] * error - motors.damping[world, joint] * velocity
+    if motors.by_velocity[joint] != 0:
+        torque = motors.damping[world, joint] * (target - velocity)
     if motors.direct != 0:
         torque = target
     if wp.isnan(torque):

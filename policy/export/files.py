@@ -193,7 +193,11 @@ def mjlab_metadata(contract: PolicyContract) -> dict[str, str]:
     limits = [_limit_before_scaling(term) for term in terms]
     names = [observation(term.name).foreign_names[:1] for term in terms]
     further = (
-        contract.action_offset or contract.layout or contract.memory or any(t.reference or t.values for t in terms)
+        contract.velocity_joints
+        or contract.action_offset
+        or contract.layout
+        or contract.memory
+        or any(t.reference or t.values for t in terms)
     )
     if None in limits or () in names or further:
         return {}
@@ -275,17 +279,37 @@ def deploy_settings(contract: PolicyContract, robot: Robot, *, finite_clips: boo
         "commands": {
             "base_velocity": {"ranges": {name: [-limit, limit] for name, limit in limits} | {"heading": None}}
         },
-        "actions": {
-            "JointPositionAction": {
-                "clip": targets if contract.target_range or finite_clips else None,
-                "joint_names": [".*"],
-                "scale": list(contract.action_scale),
-                "offset": list(contract.default_joint_position),
-                "joint_ids": None,
-            }
-        },
+        "actions": _actions(contract, targets if contract.target_range or finite_clips else None),
         "observations": observations,
     }
+
+
+def _actions(contract: PolicyContract, targets: list[Any] | None) -> dict[str, Any]:
+    """Return the actions of a ``deploy.yaml``; ``targets``: lowest and highest target of each joint. ``ExportError``: wheels come first."""
+    names, wheels = list(contract.joint_names), contract.velocity_joints
+    if not wheels:
+        groups: dict[str, list[str] | None] = {"JointPositionAction": None}
+    else:
+        groups = {
+            "JointPositionAction": [n for n in names if n not in wheels],
+            "JointVelocityAction": [n for n in names if n in wheels],
+        }
+        if [n for group in groups.values() for n in group or ()] != names:
+            raise ExportError(
+                "a deploy.yaml drives legs first and wheels last; this policy's joints stand in another order"
+            )
+
+    def entry(group: list[str] | None) -> dict[str, Any]:
+        ids = range(len(names)) if group is None else [names.index(n) for n in group]
+        return {
+            "clip": None if targets is None else [targets[i] for i in ids],
+            "joint_names": group or [".*"],
+            "scale": [contract.action_scale[i] for i in ids],
+            "offset": [contract.default_joint_position[i] for i in ids],
+            "joint_ids": None if group is None else list(ids),
+        }
+
+    return {kind: entry(group) for kind, group in groups.items()}
 
 
 def _spelled_out(contract: PolicyContract) -> PolicyContract:

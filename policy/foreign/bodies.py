@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from typing import Any
 
 from ...files.parsing import shown
@@ -110,10 +111,22 @@ def by_pattern(table: Mapping[str, Any], joints: Sequence[str], missing: Any, so
     return list(found.values())
 
 
-def no_wheels(wheels: Sequence[object], source: object) -> None:
-    """Raise ``PolicyError`` where a description drives joints by velocity."""
-    if wheels:
+def wheels_of(named: Sequence[object], robot: Robot, source: object) -> tuple[str, ...]:
+    """Return the joints, names or patterns, that a description drives by velocity; ``PolicyError`` unless these are the robot's wheels."""
+    own = robot.velocity_joints or ()
+    if named and (not own or {joint for each in named for joint in joints_named(str(each), robot)} != set(own)):
+        theirs = f"takes such targets for {', '.join(own)}" if own else "takes targets of angle alone"
         raise PolicyError(
-            f"'{source}' drives joints by velocity ({', '.join(map(str, wheels))}), as wheels are; the engines here take position "
-            "targets alone, so that a policy with wheels cannot be played"
+            f"'{source}' drives joints by velocity ({', '.join(map(str, named))}), as wheels are, and robot '{robot.name}' {theirs}; "
+            "choose another with --robot (velocity_joints in its robot.toml names its wheels)"
         )
+    return own if named else ()
+
+
+def joints_named(text: str, robot: Robot) -> list[str]:
+    """Return the robot's joints of a name, or those that a pattern fits."""
+    if (named := matching_joint(text, robot)) in robot.joint_names:
+        return [named]
+    with suppress(re.error):
+        return [joint for joint in robot.joint_names if len(text) <= 200 and re.fullmatch(text, joint)]
+    return []

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,8 +10,9 @@ from typing import Any
 from ...files.parsing import parse_yaml, read_text
 from ...robots.base import Robot
 from ..base import PolicyError
-from ..contract import History, HistoryOrder, ObservationTerm, Part, PolicyContract
-from .bodies import choose_robot, no_wheels, sdk_joints
+from ..contract import History, HistoryOrder, ObservationTerm, Part, PolicyContract, without_wheels
+from ..observation_table import WITHOUT_WHEELS
+from .bodies import choose_robot, sdk_joints, wheels_of
 from .terms import checked, clip_before_scaling, listed, own_term, symmetric
 
 
@@ -34,7 +35,7 @@ def read_deploy(data: Mapping[str, Any], path: Path, asked: Robot | None, *, of_
     In it ``stiffness`` and ``damping`` are in the order of the robot's SDK, everything else is in the policy's; entry i
     of ``joint_ids_map`` is the SDK's number of the policy's joint i. Histories are term-major unless
     ``use_gym_history`` is set, and start with copies of the first observation. Clipping comes before scaling unless
-    ``scale_first`` is set; a clip of the action limits the joint target.
+    ``scale_first`` is set; a clip of the action limits the joint target. ``JointVelocityAction`` drives wheels.
 
     Args:
         of_mjlab: the policy's file has mjlab's metadata; unitree_rl_mjlab's gait phase is zero while the command is.
@@ -58,16 +59,11 @@ def _read(data: Mapping[str, Any], path: Path, robot: Robot) -> PolicyContract:
     sdk = [int(i) for i in data["joint_ids_map"]]
     default = [float(v) for v in data["default_joint_pos"]]
     actions = dict(data["actions"])
-    wheels = actions.get("JointVelocityAction")
-    no_wheels(listed(wheels.get("joint_names"), "some", 1) if isinstance(wheels, Mapping) else (), path)
-    action = actions["JointPositionAction"]
-    offset = (
-        [float(v) for v in listed(action.get("offset"), 0.0, len(names))]
-        if action.get("offset") is not None
-        else default
-    )
+    wheels = wheels_of(_wheels(actions, names), robot, path)
+    action = _joined(actions, default, names, wheels, path)
+    offset = [float(v) for v in action["offset"]]
     moved = max((abs(o - d) for o, d in zip(offset, default, strict=True)), default=0.0) > 1e-6
-    clip = action.get("clip")
+    clip = action["clip"]
     ranges = ((data.get("commands") or {}).get("base_velocity") or {}).get("ranges") or {}
     axes = ("lin_vel_x", "lin_vel_y", "ang_vel_z")
     limits = [
@@ -80,6 +76,8 @@ def _read(data: Mapping[str, Any], path: Path, robot: Robot) -> PolicyContract:
     terms, lengths = [], []
     for name, term in settings.items():
         own, scale = own_term(name, path), tuple(float(s) for s in listed(term.get("scale"), 1.0))
+        if name == WITHOUT_WHEELS:
+            scale = without_wheels(scale, [joint in wheels for joint in names])
         clip_of_term = None
         if (given := term.get("clip")) is not None:
             limit = symmetric(float(given[0]), float(given[1]), name, path)
@@ -103,7 +101,7 @@ def _read(data: Mapping[str, Any], path: Path, robot: Robot) -> PolicyContract:
         robot=robot.name,
         joint_names=names,
         default_joint_position=tuple(default),
-        action_scale=tuple(float(v) for v in listed(action.get("scale"), 1.0, len(names))),
+        action_scale=tuple(float(v) for v in action["scale"]),
         action_offset=tuple(offset) if moved else None,
         target_range=tuple((float(low), float(high)) for low, high in clip) if clip else None,
         stiffness=tuple(float(data["stiffness"][i]) for i in sdk),
@@ -113,5 +111,49 @@ def _read(data: Mapping[str, Any], path: Path, robot: Robot) -> PolicyContract:
         history=History(length=longest, order=order, start="repeat"),
         layout=parts,
         command_limits=(limits[0], limits[1], limits[2]),
+        velocity_joints=wheels,
         provenance=provenance,
     )
+
+
+_ACTIONS = ("JointPositionAction", "JointVelocityAction")
+
+
+def _wheels(actions: Mapping[str, Any], names: Sequence[str]) -> Sequence[object]:
+    """Return what a file says of the joints that it drives by velocity: their numbers in the policy's order, else names or patterns."""
+    action = actions.get("JointVelocityAction")
+    if action is None:
+        return []
+    return _joints(action, names) or listed(action.get("joint_names"), ".*")
+
+
+def _joints(action: Mapping[str, Any], names: Sequence[str]) -> list[str]:
+    """Return the joints that an action numbers in the policy's order; none where it means all that its kind fits."""
+    ids = action.get("joint_ids")
+    return [names[int(i)] for i in ids] if isinstance(ids, list) and None not in ids else []
+
+
+def _joined(
+    actions: Mapping[str, Any], default: Sequence[float], names: Sequence[str], wheels: Sequence[str], path: Path
+) -> dict[str, list[Any]]:
+    """Return scale, offset and clip of all joints; actions for legs and for wheels stand in the order in which the network gives them."""
+    if not wheels:
+        action, joints = actions["JointPositionAction"], len(names)
+        offset = default if action.get("offset") is None else listed(action["offset"], 0.0, joints)
+        return {"scale": listed(action.get("scale"), 1.0, joints), "offset": list(offset), "clip": action.get("clip")}
+    found: dict[str, list[Any]] = {"scale": [], "offset": [], "clip": []}
+    order: list[str] = []
+    for kind in (kind for kind in actions if kind in _ACTIONS):
+        action, turned = actions[kind], kind == "JointVelocityAction"
+        mine = _joints(action, names) or [n for n in names if (n in wheels) == turned]
+        order += mine
+        usual = [0.0 if turned else default[names.index(n)] for n in mine]
+        found["scale"] += listed(action.get("scale"), 1.0, len(mine))
+        found["offset"] += usual if action.get("offset") is None else listed(action["offset"], 0.0, len(mine))
+        found["clip"] += action.get("clip") or [[-1000.0, 1000.0]] * len(mine)
+    if order != list(names):
+        raise PolicyError(
+            f"'{path}' has actions for {', '.join(order)}, in this order; its joint_ids_map has {', '.join(names)}; both must agree"
+        )
+    limited = any(actions[kind].get("clip") for kind in actions if kind in _ACTIONS)
+    return found | {"clip": found["clip"] if limited else []}

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from ...files.parsing import parse_yaml, read_text, shown
 from ...robots.base import Robot
 from ..base import PolicyError
-from ..contract import History, ObservationTerm, Part, PolicyContract
-from .bodies import breadth_first, by_pattern, choose_robot, no_wheels
+from ..contract import History, ObservationTerm, Part, PolicyContract, without_wheels
+from ..observation_table import WITHOUT_WHEELS
+from .bodies import breadth_first, by_pattern, choose_robot, wheels_of
 from .terms import checked, clip_before_scaling, listed, symmetric
 
 _FUNCTIONS = {
@@ -21,6 +22,7 @@ _FUNCTIONS = {
     "generated_commands": "command",
     "joint_pos_rel": "joint_position",
     "joint_pos": "joint_position",
+    WITHOUT_WHEELS: "joint_position",
     "joint_vel_rel": "joint_velocity",
     "joint_vel": "joint_velocity",
     "last_action": "last_action",
@@ -40,7 +42,8 @@ def read_env(data: Mapping[str, Any], path: Path, asked: Robot | None) -> Policy
 
     Joints are in Isaac Lab's order, those nearest to the base first. Histories are term-major and start with copies of the first
     observation; clipping comes before scaling; a clip of the action limits the joint target. ``clip_actions`` of the
-    ``agent.yaml`` limits the network's output.
+    ``agent.yaml`` limits the network's output. Joints stand in the actions' own order where these preserve it; a
+    JointVelocityAction drives wheels.
 
     Raises:
         PolicyError: the file is malformed, is for another robot, or asks for something that a contract cannot express.
@@ -76,40 +79,56 @@ def _read(data: Mapping[str, Any], path: Path, robot: Robot) -> PolicyContract:
         )
     default = by_pattern(body["init_state"]["joint_pos"], names, 0.0, path, "init_state.joint_pos")
     position = [a for a in data["actions"].values() if "JointPositionAction" in str(a.get("class_type"))]
-    others = [a for a in data["actions"].values() if a not in position]
-    no_wheels(
-        [n for a in others if "Velocity" in str(a.get("class_type")) for n in listed(a.get("joint_names"), "")], path
-    )
-    if len(position) != 1 or others:
+    turning = [a for a in data["actions"].values() if "JointVelocityAction" in str(a.get("class_type"))]
+    wheels = wheels_of([n for a in turning for n in listed(a.get("joint_names"), ".*")], robot, path)
+    actions = [*position, *turning]
+    if len(position) != 1 or len(turning) > 1 or len(data["actions"]) > len(actions):
         kinds = ", ".join(str(a.get("class_type")).rpartition(":")[2] for a in data["actions"].values())
-        raise PolicyError(f"'{path}' has the actions {kinds}; one JointPositionAction is supported")
-    (action,) = position
-    if any(not any(re.fullmatch(p, n) for p in listed(action.get("joint_names"), ".*")) for n in names):
-        raise PolicyError(f"'{path}' moves some joints of robot '{robot.name}' alone; all of them are needed")
+        raise PolicyError(
+            f"'{path}' has the actions {kinds}; one JointPositionAction, and a JointVelocityAction of wheels, are supported"
+        )
+    ordered: list[str] = []
+    scale, offset, ranges = (list[Any]() for _ in range(3))
+    for action in (a for a in data["actions"].values() if a in actions):
+        asked = listed(action.get("joint_names"), ".*")
+        mine = [n for n in names if any(re.fullmatch(p, n) for p in asked)]
+        if action.get("preserve_order"):
+            mine = [n for p in asked for n in names if re.fullmatch(p, n)]
 
-    def spread(value: Any, entry: str) -> list[float]:
-        table = value if isinstance(value, Mapping) else {".*": value}
-        return [float(v) for v in by_pattern(table, names, 0.0, path, entry)]
+        def spread(value: Any, entry: str, missing: Any = 0.0, mine: Sequence[str] = mine) -> list[Any]:
+            return by_pattern(value if isinstance(value, Mapping) else {".*": value}, mine, missing, path, entry)
 
-    moved = None if action.get("use_default_offset", True) else tuple(spread(action.get("offset") or 0.0, "offset"))
-    clip = action.get("clip")
-    ranges = None
-    if clip:
+        ordered += mine
+        scale += spread(action.get("scale", 1.0), "scale")
+        by_default = action.get("use_default_offset", True) and action in position
+        usual = [default[names.index(n)] for n in mine]
+        offset += usual if by_default else spread(action.get("offset") or 0.0, "offset")
         free = (-1000.0, 1000.0)
-        ranges = tuple((float(a), float(b)) for a, b in by_pattern(clip, names, free, path, "clip"))
-    terms, parts, longest = _observation(data["observations"]["policy"], path)
+        ranges += spread(action["clip"], "clip", free) if action.get("clip") else [free] * len(mine)
+    if sorted(ordered) != sorted(names):
+        raise PolicyError(f"'{path}' moves some joints of robot '{robot.name}' alone; all of them are needed")
+    in_order = ordered == list(names)
+    if not in_order and not all(a.get("preserve_order") for a in actions):
+        raise PolicyError(
+            f"'{path}' moves joints in the order {', '.join(ordered)}; preserve_order must be true for this"
+        )
+    index = [names.index(n) for n in ordered]
+    default, names = [default[i] for i in index], tuple(ordered)
+    gains = {entry: [values[i] for i in index] for entry, values in gains.items()}
+    moved = None if list(map(float, offset)) == list(map(float, default)) else tuple(float(v) for v in offset)
+    terms, parts, longest = _observation(data["observations"]["policy"], path, names, wheels, in_order=in_order)
     limits, missing = _limits(data, robot)
-    assumed = ["joints nearest to the base first, as Isaac Lab lists them"]
+    assumed = ["joints nearest to the base first, as Isaac Lab lists them"] if in_order else []
     if missing:
         assumed.append(f"command limits of robot '{robot.name}'")
     return PolicyContract(
         robot=robot.name,
         joint_names=names,
         default_joint_position=tuple(float(v) for v in default),
-        action_scale=tuple(spread(action.get("scale", 1.0), "scale")),
+        action_scale=tuple(float(v) for v in scale),
         action_offset=moved,
         action_clip=_action_clip(path),
-        target_range=ranges,
+        target_range=tuple((float(a), float(b)) for a, b in ranges) if any(a.get("clip") for a in actions) else None,
         stiffness=tuple(float(v) for v in gains["stiffness"]),
         damping=tuple(float(v) for v in gains["damping"]),
         control_period=round(float(data["sim"]["dt"]) * int(data["decimation"]), 9),
@@ -117,12 +136,20 @@ def _read(data: Mapping[str, Any], path: Path, robot: Robot) -> PolicyContract:
         history=History(length=longest, order="frame-major" if longest == 1 else "term-major", start="repeat"),
         layout=parts,
         command_limits=limits,
+        velocity_joints=wheels,
         provenance={"adapter": "Isaac Lab env.yaml", "file": path.name, "assumed": ", ".join(assumed)},
     )
 
 
-def _observation(group: Mapping[str, Any], path: Path) -> tuple[tuple[ObservationTerm, ...], tuple[Part, ...], int]:
-    """Return the terms, the parts where histories differ, and the longest history."""
+def _observation(
+    group: Mapping[str, Any], path: Path, names: Sequence[str], wheels: Sequence[str], *, in_order: bool
+) -> tuple[tuple[ObservationTerm, ...], tuple[Part, ...], int]:
+    """Return the terms, the parts where histories differ, and the longest history.
+
+    Args:
+        names, wheels: the policy's joints in its order, and those of them that are wheels.
+        in_order: the order is Isaac Lab's own; else terms by joint must say the same one.
+    """
     terms, lengths = [], []
     for name, term in group.items():
         if not isinstance(term, Mapping) or "func" not in term:
@@ -133,6 +160,15 @@ def _observation(group: Mapping[str, Any], path: Path) -> tuple[tuple[Observatio
                 f"'{path}' asks for the observation {shown(name)} ({function}); supported are: {', '.join(_FUNCTIONS)}"
             )
         scale = tuple(float(v) for v in listed(term.get("scale"), 1.0))
+        config = (term.get("params") or {}).get("asset_cfg") or {}
+        same = config.get("preserve_order") and config.get("joint_names") == list(names)
+        if function.startswith("joint_") and not in_order and not same:
+            raise PolicyError(
+                f"'{path}' moves joints in an order of its own, and the observation {shown(name)} does not have it; give both "
+                "the same joint_names with preserve_order"
+            )
+        if function == WITHOUT_WHEELS:
+            scale = without_wheels(scale, [joint in wheels for joint in names])
         limit = (
             None if term.get("clip") is None else symmetric(float(term["clip"][0]), float(term["clip"][1]), name, path)
         )

@@ -10,8 +10,8 @@ from typing import Any
 from ...files.parsing import parse_yaml, read_text, shown
 from ...robots.base import Robot
 from ..base import PolicyError
-from ..contract import History, HistoryOrder, ObservationTerm, Part, PolicyContract
-from .bodies import choose_robot, matching_joint, no_wheels
+from ..contract import History, HistoryOrder, ObservationTerm, Part, PolicyContract, without_wheels
+from .bodies import choose_robot, matching_joint, wheels_of
 from .terms import checked, listed
 
 _TERMS = {
@@ -37,7 +37,8 @@ def read_rl_sar(data: Mapping[str, Any], path: Path, asked: Robot | None, inputs
     """Return the contract that a ``config.yaml`` describes; settings of the ``base.yaml`` hold where it says nothing.
 
     Entry i of ``joint_mapping`` is the place in ``joint_names`` of the policy's joint i; everything else is in the policy's
-    order. Frame 0 of a history is the present one. A history begins with zeros.
+    order. Frame 0 of a history is the present one. A history begins with zeros. Targets of ``wheel_indices`` are velocities, and
+    the network sees their angles as zero.
 
     Args:
         inputs: names of the network's inputs, for a policy that takes the present frame and a history apart.
@@ -71,9 +72,9 @@ def _base(path: Path) -> Mapping[str, Any]:
 
 def _read(settings: Mapping[str, Any], path: Path, robot: Robot, inputs: Sequence[str]) -> PolicyContract:
     numbered = [matching_joint(str(name), robot) for name in settings["joint_names"]]
-    no_wheels([numbered[int(settings["joint_mapping"][i])] for i in settings.get("wheel_indices") or ()], path)
     names = tuple(numbered[int(i)] for i in settings["joint_mapping"])
     joints = len(names)
+    wheels = wheels_of([names[int(i)] for i in settings.get("wheel_indices") or ()], robot, path)
     clip = float(settings["clip_obs"]) if settings.get("clip_obs") is not None else None
     terms = []
     for name in settings["observations"]:
@@ -81,6 +82,8 @@ def _read(settings: Mapping[str, Any], path: Path, robot: Robot, inputs: Sequenc
             raise PolicyError(f"'{path}' asks for the observation {shown(name)}; supported are: {', '.join(_TERMS)}")
         own, key = _TERMS[name]
         scale = tuple(float(v) for v in listed(settings[key] if key else 1.0, 1.0))
+        if own == "joint_position" and wheels:
+            scale = without_wheels(scale, [joint in wheels for joint in names])
         terms.append(ObservationTerm(name=own, scale=scale, clip=clip))
     frames = [int(i) for i in settings.get("observations_history") or [0]]
     steps = {b - a for a, b in pairwise(frames)}
@@ -117,5 +120,6 @@ def _read(settings: Mapping[str, Any], path: Path, robot: Robot, inputs: Sequenc
         history=History(length=len(frames), order=order if len(frames) > 1 else "frame-major"),
         layout=layout,
         command_limits=robot.command_limits,
+        velocity_joints=wheels,
         provenance={"adapter": "rl_sar config.yaml", "file": path.name, "assumed": ", ".join(assumed)},
     )
