@@ -166,17 +166,17 @@ class PhysicsState:
     joint_torque: torch.Tensor
     """Motor torque applied in the last substep, after limits and strength [N·m], (N, J)."""
     foot_position_w: torch.Tensor
-    """Centres of the foot spheres [m], (N, F, 3)."""
+    """Centres of the feet, each the mean of its shapes' centres [m], (N, F, 3)."""
     foot_velocity_w: torch.Tensor
     """Velocities of the foot centres [m/s], (N, F, 3)."""
     foot_contact_force_w: torch.Tensor
-    """Net force of the ground on each foot [N], (N, F, 3)."""
+    """Net force of the ground on all shapes of each foot [N], (N, F, 3)."""
     foot_normal_force: torch.Tensor
     """Sum over a foot's ground contacts of the normal force, along each contact's own normal [N], (N, F)."""
     foot_tangential_force: torch.Tensor
     """Sum over a foot's ground contacts of the magnitude of the tangential force [N], (N, F)."""
     body_contact_force_w: torch.Tensor
-    """Net force of the ground on each collision body without its foot geom [N], (N, B, 3)."""
+    """Net force of the ground on each collision body without its foot's shapes [N], (N, B, 3)."""
     trunk_contact_force_w: torch.Tensor
     """Net force of the ground on the robot's trunk shapes, included in the base's entry above [N], (N, 3)."""
     ground_force_w: torch.Tensor

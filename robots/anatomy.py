@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .base import Robot
-from .body_plan import body_plan, default_pose
+from .body_plan import body_plan, default_pose, foot_centers
 from .limbs import joint_roles
 from .loading import RobotError
 
@@ -65,7 +65,7 @@ def anatomy(robot: Robot) -> Anatomy:
     model, data = default_pose(robot)
     order = {model.joint(name).id: i for i, name in enumerate(robot.joint_names)}
     ids = {i: joint for joint, i in order.items()}
-    feet = [model.geom(name).id for name in robot.foot_geoms]
+    feet = [model.geom(sole[0]).id for sole in robot.soles]
     base = model.body(robot.base_body).id
     chains = [[ids[i] for i in leg] for leg in legs]
     roles = joint_roles(model, base, chains, feet)
@@ -80,7 +80,9 @@ def anatomy(robot: Robot) -> Anatomy:
                 joints=tuple(i for i in joints if not roles[ids[i]].startswith("waist")),
                 foot=foot,
             )
-            for foot, (name, joints) in enumerate(zip(leg_names(data.geom_xpos[feet], who), legs, strict=True))
+            for foot, (name, joints) in enumerate(
+                zip(leg_names(foot_centers(model, data, robot), who), legs, strict=True)
+            )
         ),
         roles=tuple(roles.get(ids[i], "other") for i in range(robot.num_joints)),
         leg_length=sizes.leg_length,

@@ -112,7 +112,7 @@ class Robot:
     base_body: Text
     """Body that carries the free joint; its origin is the base position."""
     foot_names: _Names
-    """Name of each foot, and of its collision geom where ``foot_shapes`` is None; the geom's centre is the foot's position."""
+    """Name of each foot, and of its collision geom where ``foot_shapes`` is None."""
     collision_bodies: _Names
     """Bodies with contacts of their own in the state; foot geoms are reported apart."""
     trunk_shapes: _Names
@@ -131,8 +131,9 @@ class Robot:
     """Joints in the motor order of the maker's SDK, which a ``deploy.yaml`` refers to; None where it is not known."""
     action_scale: Annotated[tuple[_ActionScale, ...], Field(min_length=1)] | None = None
     """Change of a joint's target for an output of 1 of a standard policy [rad; rad/s]; None for 0.25."""
-    foot_shapes: _Names | None = None
-    """Collision geom of each foot; None where the geoms bear the feet's names."""
+    foot_shapes: Annotated[tuple[Text | _Names, ...], Field(min_length=1, max_length=1000)] | None = None
+    """Collision geom of each foot, or for a sole the names of several on one body; None where the geoms bear the feet's names.
+    The mean of the geoms' centres is the foot's position."""
     velocity_joints: _Names | None = None
     """Joints with targets of velocity [rad/s] instead of angle, as wheels have; None for none."""
 
@@ -151,9 +152,14 @@ class Robot:
         return tuple(name in (self.velocity_joints or ()) for name in self.joint_names)
 
     @property
+    def soles(self) -> tuple[tuple[str, ...], ...]:
+        """Return the names of each foot's collision geoms."""
+        return tuple((each,) if isinstance(each, str) else each for each in self.foot_shapes or self.foot_names)
+
+    @property
     def foot_geoms(self) -> tuple[str, ...]:
-        """Return the name of each foot's collision geom."""
-        return self.foot_shapes or self.foot_names
+        """Return the names of all collision geoms of feet, foot by foot."""
+        return tuple(name for sole in self.soles for name in sole)
 
     @property
     def held(self) -> tuple[HeldJoint, ...]:

@@ -81,10 +81,10 @@ def body_plan(robot: Robot) -> BodyPlan:
     order = {model.joint(name).id: i for i, name in enumerate(robot.joint_names)}
     wheels = {model.joint(name).id for name in robot.velocity_joints or ()}
     base = model.body(robot.base_body).id
-    feet = [model.geom(name).id for name in robot.foot_geoms]
+    soles = sole_geoms(model, robot)
     legs, abduction, lengths, below = [], [], [], []
-    for name, foot in zip(robot.foot_names, feet, strict=True):
-        chain = joint_chain(model, int(model.geom_bodyid[foot]), base)
+    for name, sole in zip(robot.foot_names, soles, strict=True):
+        chain = joint_chain(model, int(model.geom_bodyid[sole[0]]), base)
         chain = [j for j in chain if j not in wheels]
         if not chain or any(j not in order for j in chain):
             raise RobotError(f"robot '{robot.name}': the foot '{name}' is not moved by joints of joint_names")
@@ -93,16 +93,18 @@ def body_plan(robot: Robot) -> BodyPlan:
         if sideways is not None:
             abduction.append(order[sideways])
         # from the base down to the leg's first joint, and from the foot's centre to its lowest point
-        below.append(data.geom_xpos[foot, 2] - lowest_point(model, data, foot) - data.xanchor[swinging[0], 2])
-        lengths.append(stretched_length(data, swinging, foot))
+        lowest = min(lowest_point(model, data, geom) for geom in sole)
+        center = data.geom_xpos[sole].mean(axis=0)
+        below.append(center[2] - lowest - data.xanchor[swinging[0], 2])
+        lengths.append(stretched_length(data, swinging, center))
     sideways_ids = {model.joint(robot.joint_names[i]).id for i in abduction}
     bodies = [joint_chain(model, model.body(name).id, base) for name in robot.collision_bodies]
     return BodyPlan(
         legs=tuple(legs),
         abduction=tuple(abduction),
         limb_bodies=tuple(i for i, chain in enumerate(bodies) if set(chain) - sideways_ids),
-        foot_position=data.geom_xpos[feet].copy(),
-        standing_height=max(-lowest_point(model, data, foot) for foot in feet),
+        foot_position=foot_centers(model, data, robot),
+        standing_height=max(-lowest_point(model, data, geom) for sole in soles for geom in sole),
         stretched_height=float(np.mean(below) + np.mean(lengths)),
         leg_length=float(np.mean(lengths)),
         mass=float(model.body_mass.sum()),
@@ -125,7 +127,7 @@ def mirror_image(robot: Robot) -> MirrorImage:
             raise _no_image(robot, "joint", name, images[i])
         counterpart.append(found)
         sign.append(float(np.sign(along[found])))
-    feet = data.geom_xpos[[model.geom(name).id for name in robot.foot_geoms]]
+    feet = foot_centers(model, data, robot)
     pairs = []
     for name, image in zip(robot.foot_names, feet * _MIRROR, strict=True):
         distance = np.linalg.norm(feet - image, axis=1)
@@ -165,8 +167,7 @@ def model_joint_order(robot: Robot) -> list[int]:
 
 def stance_span(robot: Robot) -> float:
     """Return the largest horizontal distance between two feet in the default pose [m]: the diagonal stance span."""
-    _, data = default_pose(robot)
-    feet = [data.geom(name).xpos[:2] for name in robot.foot_geoms]
+    feet = foot_centers(*default_pose(robot), robot)[:, :2]
     return float(max(np.linalg.norm(a - b) for a, b in combinations(feet, 2)))
 
 
@@ -207,9 +208,19 @@ def sideways_and_swinging(data: mujoco.MjData, chain: Sequence[int]) -> tuple[in
     return sideways, pitch_joints(data, chain)
 
 
-def stretched_length(data: mujoco.MjData, joints: list[int], foot: int) -> float:
-    """Return the length of the links from a leg's first joint to its foot, a geom [m]; parts along a hinge do not count."""
-    links = np.diff([*data.xanchor[joints], data.geom_xpos[foot]], axis=0)
+def sole_geoms(model: mujoco.MjModel, robot: Robot) -> list[list[int]]:
+    """Return the geoms of each foot."""
+    return [[model.geom(name).id for name in sole] for sole in robot.soles]
+
+
+def foot_centers(model: mujoco.MjModel, data: mujoco.MjData, robot: Robot) -> NDArray[np.float64]:
+    """Return the centre of each foot, the mean of its geoms' centres, in the pose of ``data`` [m], (F, 3)."""
+    return np.array([data.geom_xpos[sole].mean(axis=0) for sole in sole_geoms(model, robot)])
+
+
+def stretched_length(data: mujoco.MjData, joints: list[int], foot: NDArray[np.float64]) -> float:
+    """Return the length of the links from a leg's first joint to its foot's centre [m]; parts along a hinge do not count."""
+    links = np.diff([*data.xanchor[joints], foot], axis=0)
     return sum(float(np.linalg.norm(d - a * (d @ a))) for d, a in zip(links, data.xaxis[joints], strict=True))
 
 

@@ -196,10 +196,19 @@ class ModelChecks:
     def feet(self) -> str:
         """Check that feet have shapes that meet the ground."""
         model, robot = self.model, self.robot
-        for geom in self._require(robot.foot_geoms, "foot_shapes" if robot.foot_shapes else "foot_names", "geom"):
-            if not solid(model, geom):
-                name = model.geom(geom).name
-                raise self._error(f"the foot geom '{name}' does not meet the ground; give it contype or conaffinity 1")
+        key = "foot_shapes" if robot.foot_shapes else "foot_names"
+        for foot, sole in zip(robot.foot_names, robot.soles, strict=True):
+            geoms = self._require(sole, key, "geom")
+            for name, geom in zip(sole, geoms, strict=True):
+                if not solid(model, geom):
+                    raise self._error(
+                        f"the foot geom '{name}' does not meet the ground; give it contype or conaffinity 1"
+                    )
+            bodies = {model.body(int(model.geom_bodyid[geom])).name: None for geom in geoms}
+            if len(bodies) > 1:
+                raise self._error(
+                    f"the shapes of the foot '{foot}' lie on the bodies {' and '.join(bodies)}; name shapes of one body"
+                )
         return f"{len(robot.foot_names)} feet that meet the ground: {', '.join(robot.foot_names)}"
 
     def bodies_and_sites(self) -> str:

@@ -14,7 +14,15 @@ import numpy as np
 from ..files.parsing import build, parse_json
 from .apart import run_apart
 from .base import JointParameters, Robot
-from .body_plan import body_plan, default_pose, joint_ranges, lowest_point, mirror_image
+from .body_plan import (
+    body_plan,
+    default_pose,
+    foot_centers,
+    joint_ranges,
+    lowest_point,
+    mirror_image,
+    sole_geoms,
+)
 from .checking import DEPTH_TOLERANCE, ModelChecks
 from .feet import shank_end
 from .limbs import joint_chain
@@ -91,11 +99,12 @@ def _foot_shapes(robot: Robot) -> str:
     """Check that the centre of a foot's shape, which is the foot's position, is not in the middle of a shank."""
     model, data = default_pose(robot)
     base, heights = model.body(robot.base_body).id, []
-    for name, shape in zip(robot.foot_names, robot.foot_geoms, strict=True):
-        geom = model.geom(shape).id
-        heights.append(float(data.geom_xpos[geom, 2]) - lowest_point(model, data, geom))
-        chain = joint_chain(model, int(model.geom_bodyid[geom]), base)
-        end = shank_end(model, data, geom, data.xanchor[chain[-1]]) if chain else None
+    for name, sole, center in zip(
+        robot.foot_names, sole_geoms(model, robot), foot_centers(model, data, robot), strict=True
+    ):
+        heights.append(float(center[2]) - min(lowest_point(model, data, geom) for geom in sole))
+        chain = joint_chain(model, int(model.geom_bodyid[sole[0]]), base)
+        end = shank_end(model, data, sole[0], data.xanchor[chain[-1]]) if chain and len(sole) == 1 else None
         if end is not None:
             raise RobotError(
                 f"the foot '{name}' is {end.length:.3g} m long: its centre, which counts as the foot's position, is {heights[-1]:.3f} m "

@@ -284,13 +284,13 @@ def _check(robot: Robot, source: str) -> None:
         raise RobotError(f"{source}: {lost}; the path is relative to the robot file")
     lists = ("joint_names", "foot_names", "collision_bodies", "trunk_shapes", "foot_shapes")
     for key in (*lists, "driven_joints", "velocity_joints"):
-        names = getattr(robot, key) or ()
+        names = robot.foot_geoms if key == "foot_shapes" else getattr(robot, key) or ()
         twice = [n for n in names if names.count(n) > 1]
         if twice:
             raise RobotError(f"{source}: {key} names {shown(twice[0])} twice")
     if robot.foot_shapes and len(robot.foot_shapes) != len(robot.foot_names):
-        counts = f"foot_shapes has {len(robot.foot_shapes)} names but foot_names has {len(robot.foot_names)}"
-        raise RobotError(f"{source}: {counts}; give one for each foot")
+        counts = f"foot_shapes has {len(robot.foot_shapes)} entries but foot_names has {len(robot.foot_names)}"
+        raise RobotError(f"{source}: {counts}; give one name, or one list of names, for each foot")
     if strange := [n for n in robot.velocity_joints or () if n not in robot.joint_names]:
         raise RobotError(f"{source}: velocity_joints names {shown(strange[0])}, which is none of joint_names")
     per_joint: dict[str, tuple[float, ...]] = {"default_joint_position": robot.default_joint_position}

@@ -134,7 +134,7 @@ class Survey:
 
     def leg_length(self, leg: Leg) -> float:
         """Return the length of a stretched leg [m], without the link that swings it sideways."""
-        return stretched_length(self.data, self._swinging(leg), leg.foot)
+        return stretched_length(self.data, self._swinging(leg), self.data.geom_xpos[leg.foot])
 
     def _swinging(self, leg: Leg) -> list[int]:
         return sideways_and_swinging(self.data, leg.joints)[1]

@@ -51,7 +51,8 @@ class Reference:
         self.model.dof_frictionloss[self.at_velocity] = parameters.friction_loss
         self.base = self.model.body(robot.base_body).id
         self.bodies = np.array([self.model.body(name).id for name in robot.collision_bodies])
-        self.feet = np.array([self.model.geom(name).id for name in robot.foot_geoms])
+        self.soles = [[self.model.geom(name).id for name in sole] for sole in robot.soles]
+        self.feet = np.array([geom for sole in self.soles for geom in sole])
         self.foot_radius = float(self.model.geom_size[self.feet[0], 0])
         self.torque = np.zeros(robot.num_joints)
         self.force_w = np.zeros(3)
@@ -145,16 +146,15 @@ class Reference:
 
     @property
     def foot_position(self) -> Array:
-        """Return the centres of the foot spheres, world frame [m], (F, 3)."""
-        return self.data.geom_xpos[self.feet].copy()
+        """Return the centres of the feet, the means of their geoms' centres, world frame [m], (F, 3)."""
+        return np.array([self.data.geom_xpos[sole].mean(axis=0) for sole in self.soles])
 
     @property
     def foot_jacobian(self) -> Array:
         """Return the Jacobian of the foot centres, world frame, by the model's degrees of freedom, (F, 3, V)."""
-        jacobian = np.zeros((len(self.feet), 3, self.model.nv))
-        for of_foot, foot in zip(jacobian, self.feet, strict=True):
-            point, body = self.data.geom_xpos[foot], int(self.model.geom_bodyid[foot])
-            mujoco.mj_jac(self.model, self.data, of_foot, None, point, body)
+        jacobian = np.zeros((len(self.soles), 3, self.model.nv))
+        for of_foot, point, sole in zip(jacobian, self.foot_position, self.soles, strict=True):
+            mujoco.mj_jac(self.model, self.data, of_foot, None, point, int(self.model.geom_bodyid[sole[0]]))
         return jacobian
 
     @property
@@ -165,12 +165,12 @@ class Reference:
     @property
     def foot_force(self) -> Array:
         """Return the magnitude of all contact forces on each foot [N], (F,)."""
-        force = np.zeros((len(self.feet), 3))
+        force = np.zeros((len(self.soles), 3))
         for i, contact in enumerate(self.data.contact[: self.data.ncon]):
             wrench = np.zeros(6)
             mujoco.mj_contactForce(self.model, self.data, i, wrench)
-            for foot, geom in enumerate(self.feet):
-                if geom in contact.geom:
+            for foot, sole in enumerate(self.soles):
+                if set(sole) & {int(geom) for geom in contact.geom}:
                     force[foot] += contact.frame.reshape(3, 3).T @ wrench[:3]
         return np.linalg.norm(force, axis=1)
 

@@ -10,11 +10,11 @@ from time import perf_counter
 from ...robots import Robot, load_robot
 from ..base import CAPABILITY_NAMES, BackendError, PhysicsBackend, Scene, Support, unsupported
 from ..registry import engine_class, make_backend
-from . import contact, disturbance, friction, ground, health, kinematics, legs, model, motors, refusal, stepping
+from . import contact, disturbance, friction, ground, health, kinematics, legs, model, motors, refusal, soles, stepping
 from .bench import Bench
 from .check import ENGINE_ERRORS, Check, registered
 
-ROOMS = (kinematics, motors, stepping, health, contact, legs, ground, friction, model, disturbance, refusal)
+ROOMS = (kinematics, motors, stepping, health, contact, soles, legs, ground, friction, model, disturbance, refusal)
 
 
 class Outcome(Enum):

@@ -88,9 +88,9 @@ def spatial_inertia(mass: float, center: np.ndarray, inertia: np.ndarray) -> Spa
 def build_plant(scene: Scene, robot: RobotModel, terrain: Terrain) -> Plant:
     """Return the diagram of the robot on a terrain.
 
-    Feet have point contacts on boxes and planes. The other shapes touch by faces and edges, where Drake's point contact has a
-    single point; their contacts are hydroelastic, the ground rigid and the robot compliant. So are those of feet on a terrain with
-    a height field, because Drake's point contact takes the field's convex hull.
+    Spheres of feet have point contacts on boxes and planes. The other shapes touch by faces and edges, where Drake's point
+    contact has a single point; their contacts are hydroelastic, the ground rigid and the robot compliant. So are those of spheres
+    on a terrain with a height field, because Drake's point contact takes the field's convex hull.
     """
     on_field = terrain.height_field is not None
     builder = DiagramBuilder()
@@ -110,8 +110,8 @@ def build_plant(scene: Scene, robot: RobotModel, terrain: Terrain) -> Plant:
         properties.AddProperty("material", "relaxation_time", RELAXATION * scene.physics.timestep)
         if of_robot is None:
             AddRigidHydroelasticProperties(1.0, properties)
-        elif on_field or of_robot.foot < 0:
-            edge = FOOT_RESOLUTION if of_robot.foot >= 0 else RESOLUTION
+        elif on_field or of_robot.foot < 0 or of_robot.kind != "sphere":
+            edge = FOOT_RESOLUTION if of_robot.foot >= 0 and of_robot.kind == "sphere" else RESOLUTION
             AddCompliantHydroelasticProperties(edge * thickness(of_robot), modulus(of_robot), properties)
         geometry = plant.RegisterCollisionGeometry(body, place, shape, name, properties)
         found[geometry] = properties

@@ -36,7 +36,7 @@ class DrakeWorld(World):
         self._base_q = base.floating_positions_start()
         self._base_v = base.floating_velocities_start_in_v()
         self._center = robot.links[0].center
-        self._friction = robot.foot_friction
+        self._friction, self._feet = robot.foot_friction, robot.feet
         self._q = plant.GetPositions(self._context)
         self._v = plant.GetVelocities(self._context)
 
@@ -85,11 +85,11 @@ class DrakeWorld(World):
     def feet(self) -> tuple[Array, Array]:
         """See ``World.feet``."""
         plant, positions, velocities = self._built.plant, [], []
-        for shape in self._robot.feet:
-            body = self._built.bodies[shape.link]
+        for foot in self._feet:
+            body = self._built.bodies[foot.link]
             place = plant.EvalBodyPoseInWorld(self._context, body)
             motion = plant.EvalBodySpatialVelocityInWorld(self._context, body)
-            arm = place.rotation().matrix() @ shape.position
+            arm = place.rotation().matrix() @ foot.position
             positions.append(place.translation() + arm)
             velocities.append(motion.translational() + np.cross(motion.rotational(), arm))
         return np.array(positions), np.array(velocities)
@@ -166,6 +166,6 @@ class DrakeWorld(World):
                 plant.get_joint_actuator(plant.GetJointActuatorIndices()[i]).rotor_inertia(self._context) for i in order
             ],
             "joint_damping": [joints[i].GetDamping(self._context) for i in order],
-            "foot_friction": [friction(feet[i]) for i in range(len(self._robot.feet))],
+            "foot_friction": [friction(feet[i]) for i in range(len(self._feet))],
             "floor_friction": friction(next(iter(built.terrain))),
         }

@@ -35,7 +35,7 @@ from ..base import (
 )
 from ..devices import find_device
 from ..motor_law import MotorLimits
-from .model import CONTACT_SLOTS, FOOT_SLOTS, build_models, describe_model
+from .model import CONTACT_SLOTS, ROUND_SLOTS, build_models, describe_model
 from .state import RECORDED, BatchState, Records, StateLayout
 
 _STAGE = mujoco.mjtStage.mjSTAGE_VEL.value
@@ -61,7 +61,7 @@ class MujocoBackend(PhysicsBackend):
         exact = {name: Capability(support=Support.EXACT) for name in CAPABILITY_NAMES}
         exact["gpu"] = Capability(support=Support.NONE, note="runs on CPU threads")
         exact["penetration"] = Capability(support=Support.EXACT, note="seen one substep late")
-        slots = f"single points of the {CONTACT_SLOTS} strongest contacts, {FOOT_SLOTS} for each foot"
+        slots = f"single points of the {CONTACT_SLOTS} strongest contacts, {ROUND_SLOTS} for each foot; more on soles"
         exact["contact_forces"] = Capability(support=Support.EXACT, note=slots)
         return exact
 

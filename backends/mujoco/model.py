@@ -17,9 +17,9 @@ from ..base import BackendError, Scene
 from ..description import FootContact, ModelFields
 
 CONTACT_SLOTS = 12
-"""Ground contacts reported one by one, the strongest first; a robot that lies flat has about as many."""
-FOOT_SLOTS = 3
-"""Contacts reported one by one for each foot."""
+"""Ground contacts reported one by one, the strongest first; a robot that lies flat has about as many, one on soles more."""
+ROUND_SLOTS, FLAT_SLOTS = 3, 8
+"""Contacts reported one by one for each shape of feet of spheres, and for each of other feet: a box on a box has eight."""
 FOOT_SITE = "centre of {}"
 """Name of the site that the engine adds to a foot."""
 NOTHING: dict[str, Any] = {"contype": 2, "conaffinity": 0}
@@ -64,10 +64,17 @@ def robot_spec(scene: Scene) -> mujoco.MjSpec:
 
 
 def _mark_feet(spec: mujoco.MjSpec, robot: Robot) -> None:
-    """Put a site for motion sensors at the centre of each foot's geom."""
+    """Put a site for motion sensors at the centre of each foot, the mean of its geoms' centres."""
     compiled = mujoco.MjModel.from_xml_path(str(robot.mjcf))
-    for name, shape in zip(robot.foot_names, robot.foot_geoms, strict=True):
-        spec.geom(shape).parent.add_site(name=FOOT_SITE.format(name), pos=compiled.geom(shape).pos)
+    for name, sole in zip(robot.foot_names, robot.soles, strict=True):
+        center = np.mean([compiled.geom(shape).pos for shape in sole], axis=0)
+        spec.geom(sole[0]).parent.add_site(name=FOOT_SITE.format(name), pos=center)
+
+
+def slots_per_shape(model: mujoco.MjModel | mujoco.MjSpec, robot: Robot) -> int:
+    """Return the number of contacts that are reported one by one for each shape of a foot."""
+    sphere = mujoco.mjtGeom.mjGEOM_SPHERE
+    return ROUND_SLOTS if all(model.geom(name).type == sphere for name in robot.foot_geoms) else FLAT_SLOTS
 
 
 def _set_motors(spec: mujoco.MjSpec, scene: Scene) -> None:
@@ -141,22 +148,25 @@ def add_report_sensors(spec: mujoco.MjSpec, scene: Scene) -> None:
 
     body, geom, tree = mujoco.mjtObj.mjOBJ_BODY, mujoco.mjtObj.mjOBJ_GEOM, mujoco.mjtObj.mjOBJ_XBODY
     everything = (tree, "environment")
-    for foot, shape in zip(robot.foot_names, robot.foot_geoms, strict=True):
+    slots = slots_per_shape(spec, robot)
+    for foot, sole in zip(robot.foot_names, robot.soles, strict=True):
         spec.add_sensor(
             name=f"velocity_{foot}",
             type=mujoco.mjtSensor.mjSENS_FRAMELINVEL,
             objtype=mujoco.mjtObj.mjOBJ_SITE,
             objname=FOOT_SITE.format(foot),
         )
-        contact(f"net_{foot}", "netforce", ("force",), 1, robot=(geom, shape), other=everything)
-        contact(f"each_{foot}", "maxforce", ("force",), FOOT_SLOTS, robot=(geom, shape), other=everything)
+        for shape in sole:
+            contact(f"net_{shape}", "netforce", ("force",), 1, robot=(geom, shape), other=everything)
+            contact(f"each_{shape}", "maxforce", ("force",), slots, robot=(geom, shape), other=everything)
     for name in robot.collision_bodies:
         contact(f"body_{name}", "netforce", ("force",), 1, robot=(body, name), other=everything)
     for name in robot.trunk_shapes:
         contact(f"trunk_{name}", "netforce", ("force",), 1, robot=(geom, name), other=everything)
     whole = (tree, robot.base_body)
     contact("ground_net", "netforce", ("force", "torque", "pos"), 1, robot=whole, other=everything)
-    contact("ground_each", "maxforce", ("found", "force", "pos"), CONTACT_SLOTS, robot=whole, other=everything)
+    points = max(CONTACT_SLOTS, slots * len(robot.foot_geoms))
+    contact("ground_each", "maxforce", ("found", "force", "pos"), points, robot=whole, other=everything)
     if scene.physics.watch_penetration is not None:
         contact("penetration", "mindist", ("found", "dist"), 1, robot=whole, other=(body, "terrain"))
 
@@ -194,7 +204,7 @@ def build_models(scene: Scene) -> list[mujoco.MjModel]:
 
 def describe_model(model: mujoco.MjModel, robot: Robot) -> dict[str, list[float]]:
     """Return a world's model in the terms of ``PhysicsBackend.describe``."""
-    feet, floor = [model.geom(f).id for f in robot.foot_geoms], model.geom("floor").id
+    feet, floor = [model.geom(sole[0]).id for sole in robot.soles], model.geom("floor").id
     bodies = [model.body(name).id for name in robot.collision_bodies]
     joints = [model.joint(name).id for name in robot.joint_names]
     dofs = model.jnt_dofadr[joints]

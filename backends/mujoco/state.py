@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from ..base import PhysicsState, Scene
-from .model import CONTACT_SLOTS, FOOT_SITE, FOOT_SLOTS
+from .model import FOOT_SITE, slots_per_shape
 
 RECORDED = ("qpos", "qvel", "sensordata", "actuator_force", "site_xpos")
 """Arrays recorded after each substep. Only qpos and qvel are new; the others belong to the substep's beginning."""
@@ -37,17 +37,25 @@ class StateLayout:
             return np.arange(sensor.adr[0], sensor.adr[0] + sensor.dim[0])
 
         self.foot_velocity = np.stack([columns(f"velocity_{f}") for f in robot.foot_names])
-        self.foot_net = np.stack([columns(f"net_{f}") for f in robot.foot_names])
-        self.foot_each = np.stack([columns(f"each_{f}") for f in robot.foot_names])
+        self.foot_net = np.stack([columns(f"net_{shape}") for shape in robot.foot_geoms])
+        self.foot_each = np.stack([columns(f"each_{shape}") for shape in robot.foot_geoms])
+        self.shape_slots = slots_per_shape(model, robot)
+        # the first shape of each foot; None where a foot has one shape
+        starts = np.cumsum([0, *map(len, robot.soles)])[:-1]
+        self.sole_starts = starts if len(robot.foot_geoms) > len(robot.soles) else None
         self.body_net = np.stack([columns(f"body_{b}") for b in robot.collision_bodies])
         self.trunk_net = np.stack([columns(f"trunk_{shape}") for shape in robot.trunk_shapes])
         self.ground = columns("ground_net")
-        self.points = columns("ground_each").reshape(CONTACT_SLOTS, 7)
+        self.points = columns("ground_each").reshape(-1, 7)
         self.penetration = int(columns("penetration")[1]) if scene.physics.watch_penetration is not None else None
-        # a foot geom's body reports the foot's force too, which is subtracted there
+        # a foot's body reports the foot's force too, which is subtracted there
         bodies = {model.body(b).id: i for i, b in enumerate(robot.collision_bodies)}
-        owners = [(foot, bodies.get(model.geom(g).bodyid[0])) for foot, g in enumerate(robot.foot_geoms)]
+        owners = [(foot, bodies.get(model.geom(sole[0]).bodyid[0])) for foot, sole in enumerate(robot.soles)]
         self.foot_owner = [(foot, owner) for foot, owner in owners if owner is not None]
+
+    def by_foot(self, of_shapes: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Sum values of the feet's shapes, (N, G, …), over each foot, (N, F, …)."""
+        return of_shapes if self.sole_starts is None else np.add.reduceat(of_shapes, self.sole_starts, axis=1)
 
 
 class BatchState(PhysicsState):
@@ -135,8 +143,8 @@ class BatchState(PhysicsState):
         layout, sensors = self._layout, self._arrays["sensors"]
         n = len(sensors)
         # MuJoCo reports the force of the first object on the second: the robot's on the ground
-        feet = -sensors[:, layout.foot_net]
-        each = sensors[:, layout.foot_each].reshape(n, -1, FOOT_SLOTS, 3)
+        feet = layout.by_foot(-sensors[:, layout.foot_net])
+        each = sensors[:, layout.foot_each].reshape(n, -1, layout.shape_slots, 3)
         bodies = -sensors[:, layout.body_net]
         for foot, owner in layout.foot_owner:
             bodies[:, owner] -= feet[:, foot]
@@ -148,8 +156,8 @@ class BatchState(PhysicsState):
         center = (points[:, :, 4:7] * active[..., None]).sum(1) / np.maximum(count, 1)[:, None]
         out = {
             "foot_contact_force_w": feet,
-            "foot_normal_force": each[..., 0].sum(-1),
-            "foot_tangential_force": np.hypot(each[..., 1], each[..., 2]).sum(-1),
+            "foot_normal_force": layout.by_foot(each[..., 0].sum(-1)),
+            "foot_tangential_force": layout.by_foot(np.hypot(each[..., 1], each[..., 2]).sum(-1)),
             "body_contact_force_w": bodies,
             "trunk_contact_force_w": -sensors[:, layout.trunk_net].sum(1),
             "ground_force_w": force,

@@ -102,7 +102,8 @@ def build_shared_model(scene: Scene) -> SharedModel:
     index = {int(b): i for i, b in enumerate(bodies)}
     trunk = [_find(model, scene, "geom", name) for name in scene.robot.trunk_shapes]
     geom_foot = np.full(model.ngeom, -1, dtype=np.int32)
-    geom_foot[[_find(model, scene, "geom", name) for name in robot.foot_geoms]] = np.arange(len(robot.foot_geoms))
+    for foot, sole in enumerate(robot.soles):
+        geom_foot[[_find(model, scene, "geom", name) for name in sole]] = foot
     return SharedModel(
         model=model,
         palette=_palette(scene.terrains, slots, bool(fields)),
@@ -221,11 +222,11 @@ def _links(model: mujoco.MjModel, scene: Scene, base: int) -> Tables:
     rows: list[tuple[Floats, Floats, int]] = []
     feet: list[Floats] = []
     unit = np.array([1.0, 0.0, 0.0, 0.0])
-    for name in scene.robot.foot_geoms:
-        geom = _find(model, scene, "geom", name)
-        feet.append(model.geom_pos[geom].copy())
+    for name, sole in zip(scene.robot.foot_names, scene.robot.soles, strict=True):
+        geoms = [_find(model, scene, "geom", shape) for shape in sole]
+        feet.append(model.geom_pos[geoms].mean(axis=0))
         chain: list[int] = []
-        body = int(model.geom_bodyid[geom])
+        body = int(model.geom_bodyid[geoms[0]])
         while body != base:
             if body == 0:
                 foot = f"foot '{name}' of robot '{scene.robot.name}'"

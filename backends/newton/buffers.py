@@ -116,7 +116,7 @@ def describe_newton(
 
 def _foot_contact(scene: Scene, reference: mujoco.MjModel) -> FootContact:
     """Return the contacts of the feet with a plane of MuJoCo's default properties."""
-    feet = [reference.geom(name).id for name in scene.robot.foot_geoms]
+    feet = [reference.geom(sole[0]).id for sole in scene.robot.soles]
     return FootContact.of_mujoco(
         dimension=[*reference.geom_condim[feet], 3],
         friction=[*reference.geom_friction[feet], (1.0, 0.005, 0.0001)],

@@ -34,7 +34,7 @@ class Layout:
     joint_v: wp.array[int]
     foot_body: wp.array[int]
     foot_center: wp.array[wp.vec3]
-    """Centre of the foot sphere in the frame of its body [m]."""
+    """Centre of each foot in the frame of its body [m]."""
     shape_foot: wp.array[int]
     """Index of a shape's foot, -1 for other shapes."""
     shape_body: wp.array[int]

@@ -335,8 +335,8 @@ def _layout(
     body_index = {bodies[name]: i for i, name in enumerate(robot.collision_bodies)}
     foot, body, slot = np.full((3, count), -1, dtype=np.int32)
     trunk, ground = np.zeros((2, count), dtype=np.int32)
-    feet = [shapes[name] for name in robot.foot_geoms]
-    foot[feet] = np.arange(len(feet))
+    for number, sole in enumerate(robot.soles):
+        foot[[shapes[name] for name in sole]] = number
     trunk[[shapes[name] for name in robot.trunk_shapes]] = 1
     body[:robot_shapes] = [body_index.get(index, -1) for index in world.shape_body[:robot_shapes]]
     ground[robot_shapes:] = 1
@@ -350,8 +350,8 @@ def _layout(
         joint_q=np.array([world.joint_q_start[j] for j in joints], dtype=np.int32),
         joint_v=np.array([world.joint_qd_start[j] for j in joints], dtype=np.int32),
         collision_bodies=np.array([bodies[name] for name in robot.collision_bodies], dtype=np.int32),
-        foot_body=np.array([world.shape_body[s] for s in feet], dtype=np.int32),
-        foot_center=np.array([reference.geom(name).pos for name in robot.foot_geoms]),
+        foot_body=np.array([world.shape_body[shapes[sole[0]]] for sole in robot.soles], dtype=np.int32),
+        foot_center=np.array([np.mean([reference.geom(name).pos for name in sole], axis=0) for sole in robot.soles]),
         shape_foot=foot,
         shape_body=body,
         shape_trunk=trunk,

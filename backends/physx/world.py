@@ -67,7 +67,7 @@ class PhysxWorld(World):
 
     def __init__(self, scene: Scene, robot: RobotModel, terrain: Terrain) -> None:
         _prepare()
-        self._robot, self._timestep = robot, scene.physics.timestep
+        self._robot, self._feet, self._timestep = robot, robot.feet, scene.physics.timestep
         self._physx = ovphysx.PhysX()
         self._stage = ovstage.Stage("gaitgauge")
         with TemporaryDirectory() as folder:
@@ -184,12 +184,12 @@ class PhysxWorld(World):
         """See ``World.feet``."""
         pose, velocity = self._read("link_pose")[self._link], self._read("link_velocity")[self._link]
         positions, velocities = [], []
-        for shape in self._robot.feet:
-            turn = matrix(np.roll(pose[shape.link, 3:], 1))
-            center = self._robot.links[shape.link].center
-            positions.append(pose[shape.link, :3] + turn @ shape.position)
-            arm = turn @ (shape.position - center)
-            velocities.append(velocity[shape.link, :3] + np.cross(velocity[shape.link, 3:], arm))
+        for foot in self._feet:
+            turn = matrix(np.roll(pose[foot.link, 3:], 1))
+            center = self._robot.links[foot.link].center
+            positions.append(pose[foot.link, :3] + turn @ foot.position)
+            arm = turn @ (foot.position - center)
+            velocities.append(velocity[foot.link, :3] + np.cross(velocity[foot.link, 3:], arm))
         return np.array(positions), np.array(velocities)
 
     def contacts(self) -> list[Contact]:
@@ -254,7 +254,7 @@ class PhysxWorld(World):
             "joint_armature": self._read("armature")[self._joint],
             "joint_friction_loss": friction[:, 0],
             "joint_damping": friction[:, 2],
-            "foot_friction": np.full(len(self._robot.feet), material[:, 0].mean()),
+            "foot_friction": np.full(len(self._feet), material[:, 0].mean()),
             "floor_friction": float(material[:, 0].mean()),
         }
 

@@ -48,6 +48,15 @@ class Shape:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class Foot:
+    """Centre of a foot: the mean of its shapes' centres."""
+
+    link: int
+    position: Array
+    """In the link's frame [m], (3,)."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Link:
     """A rigid body and the hinge that carries it."""
 
@@ -91,9 +100,16 @@ class RobotModel:
     """Of ``dry_friction_slope`` [N·m·s/rad], (J,)."""
 
     @property
-    def feet(self) -> list[Shape]:
-        """Return the shape of each foot."""
-        return sorted((shape for shape in self.shapes if shape.foot >= 0), key=lambda shape: shape.foot)
+    def feet(self) -> list[Foot]:
+        """Return the centre of each foot."""
+        soles: dict[int, list[Shape]] = {}
+        for shape in self.shapes:
+            soles.setdefault(shape.foot, []).append(shape)
+        return [
+            Foot(link=sole[0].link, position=np.mean([shape.position for shape in sole], axis=0))
+            for foot, sole in sorted(soles.items())
+            if foot >= 0
+        ]
 
     @property
     def collision_links(self) -> list[int]:
@@ -194,7 +210,7 @@ def _shape(scene: Scene, model: mujoco.MjModel, geom: int) -> Shape:
         quaternion=model.geom_quat[geom].copy(),
         link=int(model.geom_bodyid[geom]) - 1,
         friction=float(model.geom_friction[geom, 0]),
-        foot=robot.foot_geoms.index(name) if name in robot.foot_geoms else -1,
+        foot=next((foot for foot, sole in enumerate(robot.soles) if name in sole), -1),
         trunk=name in robot.trunk_shapes,
         vertices=vertices,
     )

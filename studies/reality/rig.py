@@ -19,6 +19,7 @@ import numpy as np
 from ...backends.base import PhysicsOptions, Scene
 from ...backends.registry import make_backend
 from ...robots import JointParameters, Robot
+from ...robots.body_plan import lowest_point
 from ...terrains.registry import make_terrain
 from .log import Array, Log, LogError
 
@@ -260,8 +261,7 @@ def _standing_height(robot: Robot, position: Array, quaternion: Any) -> float:
         data.qpos[model.joint(joint).qposadr[0]] = angle
     mujoco.mj_kinematics(model, data)
     feet = [model.geom(name).id for name in robot.foot_geoms]
-    radius = model.geom_size[feet, 0]
-    return float((data.qpos[2] - (data.geom_xpos[feet, 2] - radius)).max())
+    return float(data.qpos[2]) - min(lowest_point(model, data, foot) for foot in feet)
 
 
 # ---- many parameter sets at once ------------------------------------------------------------------------------------------

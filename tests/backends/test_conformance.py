@@ -17,6 +17,7 @@ FAKE_CANNOT = (
     "kinematics/free_fall",
     "kinematics/tumble",
     "contact/",
+    "soles/",
     "ground/",
     "friction/",
     "model/",
