@@ -147,15 +147,17 @@ def evaluate(
         ArgumentError, SuiteError, RobotError, TerrainError, PolicyError, ContractError, BackendError, StoreError: one sentence.
     """
     from .gauge.evaluate import evaluate as run
+    from .gauge.evaluate import identity, prepare
     from .gauge.report.page import write_report
-    from .studies.naming import run_folders
+    from .studies.naming import free_run_folder, run_folders
 
     _need("a path or None", out=out)
     _need("a path, or a request", policy=policy)
     request = policy if isinstance(policy, Request) else _request(policy=policy, **options)
     usual = run_folders([request.policy], Path("results"), suite=request.suite, pipeline=request.pipeline)[0]
-    folder = usual if out is None else Path(out)
-    result = run(request, folder, resume=resume, watch=watch)
+    prepared = prepare(request)
+    folder = free_run_folder(usual, ("", identity(prepared))) if out is None else Path(out)
+    result = run(prepared, folder, resume=resume, watch=watch)
     write_report(folder)
     return result
 

@@ -23,14 +23,17 @@ def run_comparison(
 ) -> None:
     """Compare, show progress, print which differences are real and where the files are."""
     request = Request(policy=contestants[0], **vars(choices))
-    with resumable(Terminal(stderr=True), "gauging") as display:
+    console = Terminal(stderr=True)
+    with resumable(console, "gauging") as display:
         found, paths = compare_all(
             contestants,
             request,
             folder=out or Path("results") / f"compare-{joined_names(contestants)}",
+            overwrite=out is not None,
             runs=out or Path("results"),
             command=["gaitgauge", *sys.argv[1:]],
             watch=shower(display),
+            say=console.say,
         )
     if json_output:
         print_json(found)
@@ -45,7 +48,7 @@ def print_comparison(console: Terminal, found: Mapping[str, Any]) -> None:
     """Print a table of differences for each pair, then the real ones in sentences."""
     for first, second in dict.fromkeys((d["first"], d["second"]) for d in found["differences"]):
         columns = ("", "of", first, second, "difference", "95 % interval", "corrected p")
-        table = make_table(f"{second} against {first}", *columns, numbers=True)
+        table = make_table(f"{second} against {first}: mean@50", *columns, numbers=True)
         table.columns[1].justify = "left"
         before = None
         for d in (d for d in found["differences"] if (d["first"], d["second"]) == (first, second)):

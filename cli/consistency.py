@@ -15,7 +15,7 @@ from ..files.parsing import bare_name
 from ..studies.consistency.page import FIELD_LABELS, TESTS, cause, difference_of_fields, verdict, write_page
 from ..studies.consistency.request import StudyRequest, StudyStatus
 from ..studies.consistency.study import prepare_study, study
-from ..studies.naming import joined_names
+from ..studies.naming import free_run_folder, joined_names
 from .console import Terminal, make_table, print_json
 from .progress import ProgressDisplay
 from .studies import resumable
@@ -27,7 +27,8 @@ def run_consistency(request: StudyRequest, backends: str, *, out: Path | None, r
     console = Terminal(stderr=True)
     prepared = prepare_study(request)  # all that can be wrong with the request is said before anything is written
     _print_skipped(console, prepared.skipped)
-    folder = out or Path("results") / f"{joined_names(request.policies)}-{bare_name(request.suite)}-consistency"
+    usual = Path("results") / f"{joined_names(request.policies)}-{bare_name(request.suite)}-consistency"
+    folder = out or free_run_folder(usual, *prepared.runs)
     with resumable(console, "comparing", folder, "--resume") as display:
         own = ["gaitgauge", *sys.argv[1:]]
         results = study(prepared, folder, resume=resume, command=own, watch=partial(_show, display))

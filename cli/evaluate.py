@@ -13,7 +13,7 @@ from typing import Any
 from rich.text import Text
 
 from ..gauge.coverage import notes, score_label, suite_label
-from ..gauge.evaluate import Status, evaluate, prepare
+from ..gauge.evaluate import Status, evaluate, identity, prepare
 from ..gauge.report.page import write_report
 from ..gauge.request import Request
 from ..gauge.result import Result
@@ -21,7 +21,7 @@ from ..gauge.results import ALL
 from ..gauge.suite import Suite
 from ..policy.contract import PolicyContract
 from ..policy.foreign.adapters import AT_ONCE, doubt
-from ..studies.naming import run_folders
+from ..studies.naming import free_run_folder, run_folders
 from .console import Terminal, make_table, print_json
 from .progress import ProgressDisplay, duration
 from .studies import resumable
@@ -37,7 +37,8 @@ def run_evaluation(request: Request, *, out: Path | None, resume: bool, clip: bo
     """Evaluate, show progress, film the robot, print the tables and where the files are."""
     prepared = prepare(request)  # all that can be wrong with the request is said before anything is written
     names: Any = {"suite": request.suite, "pipeline": request.pipeline, "parameters": request.parameters}
-    folder = out or run_folders([request.policy], Path("results"), **names)[0]
+    usual = run_folders([request.policy], Path("results"), **names)[0]
+    folder = out or free_run_folder(usual, ("", identity(prepared)))
     console = Terminal(stderr=True)
     # Ray prints its nodes' logs to standard output; that a worker was lost is one of the notices
     quiet = redirect_stdout(io.StringIO() if request.cluster else sys.stdout)

@@ -15,7 +15,7 @@ from ..studies.jury.page import write_page
 from ..studies.jury.request import JuryRequest, JuryStatus
 from ..studies.jury.study import jury, prepare_jury
 from ..studies.jury.verdict import OFF, command_words
-from ..studies.naming import joined_names
+from ..studies.naming import free_run_folder, joined_names
 from .console import Terminal, make_table, print_json
 from .policies import policy_files
 from .progress import ProgressDisplay, duration
@@ -24,11 +24,12 @@ from .studies import resumable
 
 def run_jury(request: JuryRequest, engines: str, *, out: Path | None, resume: bool, json_output: bool) -> None:
     """Judge policies, show progress, print the tables and where the files are."""
-    folder = out or Path("results") / f"{joined_names(request.policies)}-jury-{request.part}"
+    usual = Path("results") / f"{joined_names(request.policies)}-jury-{request.part}"
     names = tuple(name.strip() for name in engines.split(",") if name.strip())
     request = replace(request, engines=names, policies=policy_files(request.policies))
     console = Terminal(stderr=True)
     prepared = prepare_jury(request)  # all that can be wrong with the request is said before anything is written
+    folder = out or free_run_folder(usual, *prepared.runs)
     for engine in prepared.skipped:
         console.say(f"{engine['engine']} does not judge: {engine['reason']}")
     with resumable(console, "judging", folder, "--resume") as display:

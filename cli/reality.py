@@ -64,14 +64,17 @@ def run_measured(
     if choices.parameters is not None:
         raise UserError("--parameters is not for this command; name the parameter sets behind the policy")
     request = Request(policy=policy, **vars(choices))
-    with resumable(Terminal(stderr=True), "gauging") as display:
+    console = Terminal(stderr=True)
+    with resumable(console, "gauging") as display:
         found, paths = score_sets(
             request,
             sets,
             folder=out or Path("results") / f"measured-{joined_names([policy])}",
+            overwrite=out is not None,
             runs=out or Path("results"),
             command=["gaitgauge", *sys.argv[1:]],
             watch=shower(display),
+            say=console.say,
         )
     if json_output:
         print_json(found)

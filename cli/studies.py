@@ -12,7 +12,7 @@ from typing import Any
 import typer
 
 from ..files.writing import LOCK, lock_folder, make_folder
-from ..studies.naming import joined_names
+from ..studies.naming import found_policies, free_folder, joined_names
 from ..studies.policies import lost_policy
 from .console import Terminal, print_json, shell_command
 from .errors import UserError
@@ -79,12 +79,14 @@ def make_study(
         data: name of the file of its results.
         title: of the progress display.
     """
-    folder = out or Path("results") / f"{name}-{joined_names(request.policies)}"
+    files = found_policies(policy_files(request.policies))
+    usual = Path("results") / f"{name}-{joined_names(request.policies)}"
+    folder = out or free_folder(usual, lambda path: lost_policy(path / data, files) is None)
     request = replace(request, policies=policy_files(request.policies))
     errors = Terminal(stderr=True)
     # the folder first: an error in it is shown before anything is played
     with own_folder(folder), ProgressDisplay(errors, title) as display:
-        if lost := lost_policy(folder / data, request.policies):
+        if lost := lost_policy(folder / data, files):
             raise UserError(f"'{folder}' holds policy {lost}, which would be lost; give another folder with --out")
         results = study(
             request,

@@ -25,16 +25,16 @@ def run_worst(
     request: WorstRequest, others: str | None, *, films: bool, out: Path | None, resume: bool, json_output: bool
 ) -> None:
     """Search, show progress, film the gallery, print the table and where the files are."""
-    folder = out or Path("results") / f"worst-{joined_names([request.policy])}"
     if others is not None:
         request = replace(request, others=tuple(name.strip() for name in others.split(",") if name.strip()))
     request = replace(request, policy=policy_files((request.policy,))[0])
     console = Terminal(stderr=True)
     quality = _quality(console) if films else None  # before MuJoCo is imported
     from ..studies.worst.page import write_page
-    from ..studies.worst.study import prepare_search, search_worst
+    from ..studies.worst.study import free_search_folder, prepare_search, search_worst
 
     prepared = prepare_search(request)  # all that can be wrong with the request is said before anything is written
+    folder = out or free_search_folder(Path("results") / f"worst-{joined_names([request.policy])}", prepared)
     for engine in prepared.skipped:
         console.say(f"{engine['engine']} does not play failures again: {engine['reason']}")
     with resumable(console, "searching", folder, "--resume") as display:

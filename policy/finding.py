@@ -11,7 +11,8 @@ SHIPPED = Path(__file__).parent / "pretrained"
 """The folder of the policies that ship with the project, ``<name>.gauge.pt``."""
 PRETRAINED = SHIPPED / "go2.gauge.pt"
 """The one that ``pretrained`` stands for."""
-_OF_RUNS = ("latest", "best")
+OF_RUNS = ("latest", "best")
+"""Names of checkpoints of the last training run."""
 _ENDING = ".gauge.pt"
 
 
@@ -23,7 +24,7 @@ def shipped_policies() -> dict[str, Path]:
 
 def policy_names() -> tuple[str, ...]:
     """Return the names that ``find_policy`` takes beside paths."""
-    return (*_OF_RUNS, *shipped_policies())
+    return (*OF_RUNS, *shipped_policies())
 
 
 def find_policy(path_or_name: str | Path) -> Path:
@@ -48,7 +49,7 @@ def find_policy(path_or_name: str | Path) -> Path:
         raise PolicyError(f"'{name}' cannot be read: {getattr(error, 'strerror', None) or error}") from error
     names = policy_names()
     if name in names and not path.is_file():
-        found = _of_runs(name) if name in _OF_RUNS else shipped_policies()[name]
+        found = _of_runs(name) if name in OF_RUNS else shipped_policies()[name]
         if found is None:
             wanted = "best.pt" if name == "best" else "model_<iteration>.pt"
             raise PolicyError(

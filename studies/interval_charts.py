@@ -8,6 +8,8 @@ from typing import Any
 
 WIDTH, INSET = 260.0, 6.0
 """Of a line."""
+_LEAST = 1e-3
+"""Smallest half width of a scale: tables have four decimals, and what they show as zero is drawn as zero."""
 
 
 def common_scale(estimates: Sequence[Mapping[str, Any] | None], *, signed: bool) -> tuple[float, float]:
@@ -18,7 +20,7 @@ def common_scale(estimates: Sequence[Mapping[str, Any] | None], *, signed: bool)
         signed: whether zero lies in the middle.
     """
     numbers = [abs(v) for e in estimates if e is not None for v in (e["value"], *e["interval"])]
-    top = _rounded_up(max(numbers, default=0.0) or 1e-6)
+    top = _rounded_up(max(numbers, default=0.0))
     return (-top if signed else 0.0, top)
 
 
@@ -52,6 +54,7 @@ def _x(value: float, scale: tuple[float, float]) -> float:
 
 
 def _rounded_up(value: float) -> float:
-    """The next 1, 2 or 5 times a power of ten."""
+    """Return the next 1, 2 or 5 times a power of ten, at least ``_LEAST``."""
+    value = max(value, _LEAST)
     power = 10.0 ** math.floor(math.log10(value))
     return next(m * power for m in (1.0, 2.0, 5.0, 10.0) if m * power >= value * (1.0 - 1e-9))

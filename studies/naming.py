@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from ..files.parsing import bare_name, one_line
+from ..gauge.store import StoreError, check_folder
+from ..policy.base import PolicyError
+from ..policy.finding import OF_RUNS, find_policy
 
 _LONGEST = 80
 """Characters of a name."""
@@ -72,7 +77,7 @@ def folder_name(name: str) -> str:
 
 def joined_names(policies: Sequence[str]) -> str:
     """The names of some policies as one folder's name."""
-    names = [folder_name(name) for name in distinct_names(list(dict.fromkeys(policies)))]
+    names = [folder_name(name) for name in distinct_names(found_policies(dict.fromkeys(policies)))]
     whole = "-".join(names)
     return whole if len(whole) <= _LONGEST_FOLDER else f"{'-'.join(names[:3])[:_LONGEST_FOLDER]}-of-{len(names)}"
 
@@ -80,7 +85,41 @@ def joined_names(policies: Sequence[str]) -> str:
 def run_folders(
     policies: Sequence[str], root: Path, *, suite: str, pipeline: str, parameters: str | None = None
 ) -> list[Path]:
-    """Where the evaluation of each of some policies goes unless the user says so."""
+    """Return the folder of the evaluation of each of some policies, before ``free_folder``."""
     sets = [] if parameters is None else [bare_name(Path(parameters).name)]
     end = "-".join([bare_name(suite), *sets, pipeline])
-    return [root / f"{folder_name(name)}-{end}" for name in distinct_names(policies)]
+    return [root / f"{folder_name(name)}-{end}" for name in distinct_names(found_policies(policies))]
+
+
+def found_policies(policies: Iterable[str]) -> list[str]:
+    """Return policies with the checkpoints that ``latest`` and ``best`` stand for now: the next training changes them."""
+    found = []
+    for name in policies:
+        with suppress(PolicyError):  # what is wrong with it is said when it is loaded
+            name = str(find_policy(name)) if name in OF_RUNS else name
+        found.append(name)
+    return found
+
+
+def free_folder(folder: Path, is_free: Callable[[Path], bool]) -> Path:
+    """Return a folder, or the first of ``<folder>-2``, ``<folder>-3`` …, that is free."""
+    numbered = (folder.with_name(f"{folder.name}-{number}") for number in itertools.count(2))
+    return next(path for path in itertools.chain([folder], numbered) if is_free(path))
+
+
+def free_run_folder(folder: Path, *runs: tuple[str, Mapping[str, Any]]) -> Path:
+    """Return a folder, or the first of ``<folder>-2`` …, in which no other runs are.
+
+    Args:
+        runs: folder of each run in it, ``""`` for itself, and the request that decides about its results.
+    """
+
+    def is_free(candidate: Path) -> bool:
+        try:
+            for name, request in runs:
+                check_folder(candidate / name, request, resume=True)
+        except StoreError:
+            return False
+        return True
+
+    return free_folder(folder, is_free)

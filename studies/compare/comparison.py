@@ -22,10 +22,10 @@ from ...gauge.result_figures import BY_HAND, check_figures
 from ...gauge.totals import ONE_SEED, environment_weights, runs_at
 from ..naming import distinct_names
 
-KINDS = ("score", "level", "group", "terrain", "friction", "payload", "metric", "command")
-"""Kinds of differences, in the order in which it is shown. The first stands alone, the others are one family of tests. Metrics and
-sub-commands are compared as measured, in the environments where both policies were measured at the same level; all else counts
-levels."""
+KINDS = ("score", "level", "group", "terrain", "friction", "payload", "metric", "metric as measured", "command")
+"""Kinds of differences, in the order in which it is shown. The first stands alone, the others are one family of tests. A metric is
+``Result.metrics``, weighted by level. Metrics as measured and sub-commands are compared in the environments where both policies
+were measured at the same level; all else counts levels."""
 _SAME = {"backend": "engine", "robot": "robot", "pipeline": "pipeline"}
 """Fields that must be the same in all results, and their names for readers."""
 
@@ -321,6 +321,8 @@ def _reported(result: Result, kind: str, name: str, value: float) -> float:
         return result.score or 0.0
     if kind == "group":
         return result.groups[name]
+    if kind == "metric":
+        return result.metrics[name].mean50
     found = result.terrains[name].score if kind == "terrain" else value
     return 0.0 if found is None else found
 
@@ -346,13 +348,15 @@ def _quantities(result: Result, first: Evidence, second: Evidence) -> Iterator[t
     for axis, other in (("friction", "payload"), ("payload", "friction")):
         for value, weights in _sweep(rows, axis, other):
             yield axis, f"{value:g}", partial(_score, weights, (QUALITY,))
+    for metric in result.metrics:
+        yield "metric", metric, partial(_score, even, (metric,))
     at_same = _at_same_levels(first, second)
     alike = np.array([bool(row.runs) for row in at_same[first].rows])
     if alike.any():
         same = alike / alike.sum()
         commands = next(list(next(iter(row.runs.values())).commands) for row in rows if row.runs)
         for metric in result.metrics:
-            yield "metric", metric, partial(_as_measured, same, (metric,), at_same)
+            yield "metric as measured", metric, partial(_as_measured, same, (metric,), at_same)
         for command in commands:
             yield "command", command, partial(_as_measured, same, (command,), at_same)
 

@@ -12,13 +12,18 @@ from ...gauge.evaluate import Prepared, Request, Status, evaluate, identity, pre
 from ...gauge.report.page import write_report
 from ...gauge.result import EnvironmentRow, PolicyName, Provenance, Result, SuiteName
 from ...gauge.results import chance_rules
-from ...gauge.store import check_folder
+from ...gauge.suite import load_suite
 from ...policy.finding import find_policy
 from ...policy.loading import own_contract
 from ...robots.loading import robot_digest
-from ..naming import distinct_names, run_folders
+from ..naming import distinct_names, free_run_folder, run_folders
 from .comparison import ComparisonError, check_alike, check_different, compare, load_result
 from .report import write_comparison
+
+_SEEDS = 3
+"""Seeds where the suite has one: as many as gaitgauge-1 has."""
+_TELLS_NOTHING = "which tells no difference from chance"
+_ADVICE = "with three seeds or more (--seed 0 --seed 1 --seed 2)"
 
 
 def is_result(contestant: str) -> bool:
@@ -32,17 +37,21 @@ def compare_all(
     request: Request,
     *,
     folder: Path,
+    overwrite: bool = True,
     runs: Path,
     command: Sequence[str] = (),
     watch: Callable[[Status], None] | None = None,
+    say: Callable[[str], None] = lambda _: None,
 ) -> tuple[dict[str, Any], dict[str, Path]]:
     """Evaluate what has not been evaluated yet, compare, and write the comparison; returns it as plain data, and its files.
 
     Args:
         request: how policies are evaluated; its policy is replaced by each.
         folder: where the comparison goes.
+        overwrite: write over a comparison of other results there; False for ``<folder>-2`` … in its place.
         runs: folder of the evaluations; what it holds is gone on with.
         watch: called a few times a second during an evaluation.
+        say: called with a sentence where seeds are added.
 
     Raises:
         ComparisonError and those of ``evaluate``: one sentence. What can be known to be wrong is said before anything is played.
@@ -50,6 +59,13 @@ def compare_all(
     if len(contestants) < 2:
         raise ComparisonError(f"a comparison needs at least two policies or results; only '{contestants[0]}' was given")
     found = {c: load_result(Path(c)) for c in contestants if is_result(c)}
+    if len(found) < len(contestants):
+        lone = [c for c, result in found.items() if len(result.chance.seeds) == 1]
+        if lone:
+            raise ComparisonError(
+                f"the results of '{lone[0]}' have one seed, {_TELLS_NOTHING}; evaluate its policy again {_ADVICE}"
+            )
+        request = deciding_request(request, say)
     requests = {
         c: replace(request, policy=c, contract=own_contract(c, request.contract)) for c in contestants if c not in found
     }
@@ -57,9 +73,11 @@ def compare_all(
     check_different([found.get(c) or find_policy(c).resolve() for c in contestants], contestants)
     check_alike([found.get(c) or _known_before(prepared_requests[c]) for c in contestants], contestants)
     names: Any = {"suite": request.suite, "pipeline": request.pipeline, "parameters": request.parameters}
-    folders = run_folders(list(requests), runs, **names)
-    for prepared, target in zip(prepared_requests.values(), folders, strict=True):
-        check_folder(target, identity(prepared), resume=True)
+    usual = run_folders(list(requests), runs, **names)
+    folders = [
+        free_run_folder(target, ("", identity(prepared)))
+        for prepared, target in zip(prepared_requests.values(), usual, strict=True)
+    ]
     labelled = {
         c: f"{c}/{result.policy.path}" for c, result in found.items()
     }  # a card's own name where its policy has none
@@ -68,7 +86,32 @@ def compare_all(
         write_report(target)
     labels = distinct_names([labelled.get(c, found[c].policy.path) for c in contestants])
     comparison = compare([found[c] for c in contestants], labels)
-    return comparison.plain(), write_comparison(folder, comparison)
+    return comparison.plain(), write_comparison(folder, comparison, overwrite=overwrite)
+
+
+def deciding_request(request: Request, say: Callable[[str], None]) -> Request:
+    """Return a request with seeds enough for a comparison: with one seed nothing can be told from chance.
+
+    Args:
+        say: called with a sentence where seeds are added to the suite's single one.
+
+    Raises:
+        ComparisonError: one seed was asked for, or the pipeline plays one.
+        SuiteError: there is no such suite.
+    """
+    suite = load_suite(request.suite)
+    seeds = dict.fromkeys(request.seeds or suite.matrix.seeds)
+    if request.pipeline == "base":
+        raise ComparisonError(f"pipeline 'base' plays one seed, {_TELLS_NOTHING}; use --pipeline multi")
+    if len(seeds) > 1 or request.pipeline == "level":
+        return request
+    (only,) = seeds
+    if request.seeds:
+        raise ComparisonError(f"seed {only} is the only one, {_TELLS_NOTHING}; compare {_ADVICE}")
+    seeds = dict.fromkeys(range(only, only + _SEEDS))
+    named = " and ".join([", ".join(map(str, list(seeds)[:-1])), str(only + _SEEDS - 1)])
+    say(f"suite '{suite.name}' has one seed, {_TELLS_NOTHING}: every policy is played with seeds {named}")
+    return replace(request, seeds=tuple(seeds))
 
 
 def _known_before(prepared: Prepared) -> Result:

@@ -4,26 +4,33 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
 import jinja2
 
-from ...files.parsing import edited, one_line
+from ...files.parsing import edited, one_line, read_results
 from ...files.writing import csv_text, write_files
 from ...gauge.metrics import metric_label
 from ...gauge.report.charts import terrain_label
 from ...gauge.report.pages import page_template
 from .. import interval_charts
+from ..naming import free_folder
 from .comparison import KINDS, Comparison, ComparisonError, Difference, format_p
 
 _TEX = {"&": r"\&", "%": r"\%", "_": r"\_", "#": r"\#", "$": r"\$", "{": r"\{", "}": r"\}", "\\": r"\textbackslash{}"}
 _TEX |= {"~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "<": "$<$", "–": "--"}
+_SAME_RUNS = ("file_sha256", "coverage", "seeds")
+"""Fields of a policy in which the same comparison made again is alike."""
 _LONGEST = 100_000
 """Characters of a line of LaTeX: a line's end would end a comment, too."""
 
 
-def write_comparison(folder: Path, found: Comparison) -> dict[str, Path]:
+def write_comparison(folder: Path, found: Comparison, *, overwrite: bool = True) -> dict[str, Path]:
     """Write all files of a comparison, each whole or not at all; their paths by kind (``json``, ``csv``, ``tex``, ``html``).
+
+    Args:
+        overwrite: write over a comparison of other results in the folder; False for ``<folder>-2`` … in its place.
 
     Raises:
         ComparisonError: they cannot be written, or the results hold what no evaluation writes.
@@ -35,8 +42,24 @@ def write_comparison(folder: Path, found: Comparison) -> dict[str, Path]:
             "tex": as_latex(found),
             "html": as_page(found),
         }
+    if not overwrite:
+        folder = free_folder(folder, partial(_is_free, found))
     write_files(folder, {f"comparison.{kind}": text for kind, text in contents.items()}, ComparisonError)
     return {kind: folder / f"comparison.{kind}" for kind in contents}
+
+
+def _is_free(found: Comparison, folder: Path) -> bool:
+    """Return whether a folder holds no comparison, or one of the same episodes of the same policies."""
+    file = folder / "comparison.json"
+    if not file.is_file():
+        return True
+    try:
+        there = read_results(file, "comparison", ComparisonError)
+        before = [there["suite"], *({k: p[k] for k in _SAME_RUNS} for p in there["policies"])]
+    except (ComparisonError, KeyError, TypeError):
+        return False  # not what this function wrote
+    mine = json.loads(json.dumps(found.plain()))
+    return bool(before == [mine["suite"], *({k: p[k] for k in _SAME_RUNS} for p in mine["policies"])])
 
 
 def as_csv(found: Comparison) -> str:
@@ -105,6 +128,7 @@ def label(found: Difference) -> str:
     words: dict[str, Callable[[str], str]] = {
         "terrain": terrain_label,
         "metric": metric_label,
+        "metric as measured": metric_label,
         "payload": "{} kg".format,
     }
     return words.get(found.kind, lambda name: name.replace("_", " "))(found.name)

@@ -71,6 +71,28 @@ class PreparedStudy:
         """The reference and the others."""
         return [self.reference, *self.others]
 
+    def home(self, number: int) -> Path:
+        """Return the folder of the policy of that number within the study's."""
+        return Path(f"{number + 1}-{Path(self.policies[number][0]).name}") if len(self.policies) > 1 else Path()
+
+    def identity(self, policy: FilePolicy, variant: Variant) -> dict[str, Any]:
+        """Return what decides about the records of a policy in a variant."""
+        return common_identity(self.suite, policy.digest, self.robot, variant.device, self.seeds) | {
+            "pipeline": "consistency",
+            "variant": variant.label,
+            "robot": self.request.robot or self.robot.name,
+            "cells": [f"{c.terrain}-L{c.level}-f{c.friction:g}" for c in self.cells],
+        }
+
+    @property
+    def runs(self) -> list[tuple[str, dict[str, Any]]]:
+        """Return the folder of every engine's run within the study's, and its identity."""
+        return [
+            (str(self.home(number) / variant.folder), self.identity(policy, variant))
+            for number, (_, policy) in enumerate(self.policies)
+            for variant in self.engines
+        ]
+
     def drop(self, variant: Variant, reason: str) -> None:
         """Leave out an engine that turned out unable.
 
@@ -205,11 +227,9 @@ def study(
     request = prepared.request
     prepared = replace(prepared, others=list(prepared.others), skipped=list(prepared.skipped))  # engines may drop out
     torch.set_num_threads(1)  # several would change the last bits of the policy's output
-    several = len(prepared.policies) > 1
     blocks = []
     for number, (name, policy) in enumerate(prepared.policies):
-        home = folder / f"{number + 1}-{Path(name).name}" if several else folder
-        blocks.append(_Policy(prepared, name, policy, home, resume=resume, watch=watch).run())
+        blocks.append(_Policy(prepared, name, policy, folder / prepared.home(number), resume=resume, watch=watch).run())
     results: dict[str, Any] = {
         "schema": SCHEMA,
         "suite": {"name": prepared.suite.name, "version": prepared.suite.version, "title": prepared.suite.title},
@@ -297,7 +317,9 @@ class _Policy:
         self._part += 1
         episodes = prepared.design.episodes()
         status = partial(StudyStatus, self._name, variant.label, self._part, self._parts, episodes=len(episodes))
-        with RunFolder(self._folder / variant.folder, self._identity(variant), resume=self._resume) as store:
+        with RunFolder(
+            self._folder / variant.folder, prepared.identity(self._policy, variant), resume=self._resume
+        ) as store:
             play_variant(
                 variant,
                 episodes,
@@ -311,17 +333,6 @@ class _Policy:
             )
         self._records[variant.label] = store.records
         return store.records
-
-    def _identity(self, variant: Variant) -> dict[str, Any]:
-        """What decides about the records of a variant."""
-        prepared = self._prepared
-        shared = common_identity(prepared.suite, self._policy.digest, prepared.robot, variant.device, prepared.seeds)
-        return shared | {
-            "pipeline": "consistency",
-            "variant": variant.label,
-            "robot": prepared.request.robot or prepared.robot.name,
-            "cells": [f"{c.terrain}-L{c.level}-f{c.friction:g}" for c in prepared.cells],
-        }
 
     def _switches(self) -> list[tuple[Factor, Variant]]:
         """Which factor is switched in which engine: the reference's, and buffer sizes in the engines that have them."""

@@ -62,6 +62,25 @@ class PreparedJury:
         """Return the family of each engine."""
         return {v.label: engine_class(v.backend).family or v.backend for v in self.engines}
 
+    def home(self, label: str) -> Path:
+        """Return the folder of a policy within the jury's."""
+        return Path(folder_name(label)) if len(self.policies) > 1 else Path()
+
+    def identity(self, label: str, variant: Variant) -> dict[str, Any]:
+        """Return what decides about the records of a policy in an engine."""
+        return common_identity(
+            self.suite, self.policies[label].policy.digest, self.robot, variant.device, self.bench.seeds
+        ) | {
+            "pipeline": "jury",
+            "engine": variant.label,
+            "cells": [f"{c.terrain}-L{c.level}-f{c.friction:g}" for c in self.bench.cells],
+        }
+
+    @property
+    def runs(self) -> list[tuple[str, dict[str, Any]]]:
+        """Return the folder of every run within the jury's, and its identity."""
+        return [(str(self.home(p) / v.folder), self.identity(p, v)) for p in self.policies for v in self.engines]
+
 
 def prepare_jury(request: JuryRequest) -> PreparedJury:
     """Check a request and load what it names; engines of the default that are not installed are left out.
@@ -190,7 +209,7 @@ class _Session:
         prepared = self._prepared
         if not self._expected:
             self._measure(loaded)
-        home = self._folder / folder_name(label) if len(prepared.policies) > 1 else self._folder
+        home = self._folder / prepared.home(label)
         found: dict[str, Records] = {}
         for variant in prepared.engines:
             self._turn += 1
@@ -215,13 +234,7 @@ class _Session:
     def _play(self, label: str, loaded: Loaded, variant: Variant, home: Path) -> Records:
         """Return the records of all episodes in an engine."""
         prepared = self._prepared
-        identity = common_identity(
-            prepared.suite, loaded.policy.digest, prepared.robot, variant.device, prepared.bench.seeds
-        ) | {
-            "pipeline": "jury",
-            "engine": variant.label,
-            "cells": [f"{c.terrain}-L{c.level}-f{c.friction:g}" for c in prepared.bench.cells],
-        }
+        identity = prepared.identity(label, variant)
         began = time.perf_counter()
         with RunFolder(home / variant.folder, identity, resume=self._resume) as store:
             played = len(store.records)

@@ -29,7 +29,8 @@ LABELS = {"slope_fd": "slope up", "slope_bd": "slope down", "stairs_fd": "stairs
 LABELS |= {"obstacle": "obstacles"}
 """Terrains as a robot meets them that walks forward from where quality episodes start."""
 _COLOURS = ("#0072b2", "#e69f00", "#d55e00", "#cc79a7", "#009e73", "#56b4e9", "#5c4033", "#9a9a00")
-"""Okabe and Ito's, without yellow and black; readers who see colours differently can tell them apart."""
+"""Okabe and Ito's, without yellow and black; readers who see colours differently can tell them apart. Others follow for more classes."""
+_GOLDEN_ANGLE = 137.508
 _SIDE, _LEFT, _TOP, _GAP = 300.0, 34.0, 46.0, 26.0
 _MOST_POINTS = 1500
 """Points of a policy that are drawn; all of them are in the CSV file."""
@@ -91,7 +92,10 @@ _fixed = partial(fixed, digits=2)
 
 
 def _colour(index: int) -> str:
-    return _COLOURS[index % len(_COLOURS)]
+    if index < len(_COLOURS):
+        return _COLOURS[index]
+    hue = (index * _GOLDEN_ANGLE) % 360.0  # of neighbours far apart, and never the same again
+    return f"hsl({hue:.1f}, 65%, {(38, 58)[index % 2]}%)"
 
 
 def _template(name: str) -> jinja2.Template:

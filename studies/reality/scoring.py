@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import Any
 
 from ...files.parsing import bare_name
-from ...gauge.evaluate import Request, Status, evaluate, prepare
+from ...gauge.evaluate import Request, Status, evaluate, identity, prepare
 from ...gauge.report.page import write_report
 from ..compare.comparison import compare
+from ..compare.contestants import deciding_request
 from ..compare.report import write_comparison
-from ..naming import run_folders
+from ..naming import free_run_folder, run_folders
 from .log import LogError
 
 
@@ -21,9 +22,11 @@ def score_sets(
     sets: Sequence[str],
     *,
     folder: Path,
+    overwrite: bool = True,
     runs: Path,
     command: Sequence[str] = (),
     watch: Callable[[Status], None] | None = None,
+    say: Callable[[str], None] = lambda _: None,
 ) -> tuple[dict[str, Any], dict[str, Path]]:
     """Evaluate a policy under each parameter set and compare; return the comparison as plain data, and its files.
 
@@ -31,8 +34,10 @@ def score_sets(
         request: how it is evaluated; its ``parameters`` are replaced by each set.
         sets: names or files, as for ``find_set``; the first is the one that the others are compared with.
         folder: of the comparison.
+        overwrite: as of ``compare_all``.
         runs: folder of the evaluations; what it holds is gone on with.
         watch: called a few times a second during an evaluation.
+        say: called with a sentence where seeds are added.
 
     Raises:
         LogError: fewer than two sets, or two of one name.
@@ -44,10 +49,12 @@ def score_sets(
         raise LogError(
             f"a policy is compared under two or more different parameter sets, and {given} was given (--parameters)"
         )
+    request = deciding_request(request, say)
     prepared = [prepare(replace(request, parameters=name)) for name in sets]
     results = []
     for name, one in zip(sets, prepared, strict=True):
-        target = run_folders([request.policy], runs, suite=request.suite, pipeline=request.pipeline, parameters=name)[0]
+        usual = run_folders([request.policy], runs, suite=request.suite, pipeline=request.pipeline, parameters=name)[0]
+        target = free_run_folder(usual, ("", identity(one)))
         results.append(evaluate(one, target, resume=True, command=command, watch=watch))
         write_report(target)
     robot = results[0].provenance.digests["robot"]  # one machine, whatever set stands for it
@@ -55,4 +62,4 @@ def score_sets(
         replace(r, provenance=replace(r.provenance, digests={**r.provenance.digests, "robot": robot})) for r in results
     ]
     comparison = compare(alike, labels)
-    return comparison.plain(), write_comparison(folder, comparison)
+    return comparison.plain(), write_comparison(folder, comparison, overwrite=overwrite)

@@ -25,6 +25,7 @@ from ...gauge.suite import load_suite
 from ...robots import Robot
 from ...robots.loading import robot_digest
 from ..consistency.variants import Variant, parse_variant, place
+from ..naming import free_folder
 from ..policies import Loaded, describe, load_policies
 from ..trials.scenario import Scenario, scenario_text
 from .playing import Play, Players
@@ -191,27 +192,46 @@ def _identity(prepared: PreparedSearch) -> dict[str, Any]:
     }
 
 
+def free_search_folder(folder: Path, prepared: PreparedSearch) -> Path:
+    """Return a folder, or the first of ``<folder>-2`` …, in which no other search is."""
+
+    def is_free(candidate: Path) -> bool:
+        try:
+            _check_folder(candidate, json.loads(json.dumps(_identity(prepared))), resume=True)
+        except WorstError:
+            return False
+        return True
+
+    return free_folder(folder, is_free)
+
+
+def _check_folder(folder: Path, wanted: dict[str, Any], *, resume: bool) -> None:
+    """Raise ``WorstError`` where a search cannot use a folder."""
+    marker = folder / "search.json"
+    if folder.exists() and not folder.is_dir():
+        raise WorstError(f"{folder} is a file; give a folder with --out")
+    if marker.is_file():
+        present = parse_json(read_text(marker, "search", WorstError), str(marker), WorstError)
+        if present != wanted:
+            different = sorted(k for k in wanted if not isinstance(present, dict) or present.get(k) != wanted[k])
+            raise WorstError(
+                f"{folder} belongs to another search ({', '.join(different)} differ); give another folder with --out"
+            )
+        if not resume:
+            raise WorstError(
+                f"{folder} already holds this search; go on with --resume, or give another folder with --out"
+            )
+    elif folder.exists() and any(folder.iterdir()):
+        raise WorstError(f"{folder} is not empty and holds no search; give another folder with --out")
+
+
 class _Log:
     """Finished batches on disk, by what was played: who plays the same again reads them."""
 
     def __init__(self, folder: Path, identity: dict[str, Any], *, resume: bool) -> None:
         marker, wanted = folder / "search.json", json.loads(json.dumps(identity))
         self._folder = folder / "batches"
-        if folder.exists() and not folder.is_dir():
-            raise WorstError(f"{folder} is a file; give a folder with --out")
-        if marker.is_file():
-            present = parse_json(read_text(marker, "search", WorstError), str(marker), WorstError)
-            if present != wanted:
-                different = sorted(k for k in wanted if not isinstance(present, dict) or present.get(k) != wanted[k])
-                raise WorstError(
-                    f"{folder} belongs to another search ({', '.join(different)} differ); give another folder with --out"
-                )
-            if not resume:
-                raise WorstError(
-                    f"{folder} already holds this search; go on with --resume, or give another folder with --out"
-                )
-        elif folder.exists() and any(folder.iterdir()):
-            raise WorstError(f"{folder} is not empty and holds no search; give another folder with --out")
+        _check_folder(folder, wanted, resume=resume)
         make_folder(self._folder, WorstError)
         self._lock = lock_folder(folder, WorstError)
         write_atomically(marker, json_text(wanted), WorstError)

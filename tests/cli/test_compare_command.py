@@ -99,14 +99,24 @@ def test_policies_whose_files_are_called_alike_are_told_apart_before_anything_is
     assert {p.name for p in (tmp_path / "results").iterdir()} == {"compare-HIM-seed-1-CTS-seed-1", *names}
 
 
-def test_a_folder_of_another_run_is_refused_before_the_first_policy_is_played(
-    run, refused, tmp_path, policy, contract, stored, tiny
-):
+def test_the_folder_of_another_run_is_left_alone(run, tmp_path, policy, contract, stored, tiny):
     (tmp_path / "other").mkdir()
     leans = {name: value + 0.1 for name, value in stored.state_dict.items()}
     save_policy(tmp_path / "other" / "walk.gauge.pt", contract, replace(stored, state_dict=leans))
-    assert run("evaluate", "other/walk.gauge.pt", "--suite", tiny, "--threads", 1).exit_code == 0
+    flat = ("--suite", tiny, "--terrain", "flat", "--threads", 1)
+    assert run("evaluate", "other/walk.gauge.pt", *flat).exit_code == 0
+    before = (tmp_path / "results/walk-tiny-stress/results.json").read_bytes()
     shutil.copy(policy, tmp_path / "walk.gauge.pt")
-    sentence = refused("compare", policy, "walk.gauge.pt", "--suite", tiny, "--threads", 1)
-    assert "walk-tiny-stress belongs to another run" in sentence
-    assert [p.name for p in (tmp_path / "results").iterdir()] == ["walk-tiny-stress"]
+    done = run("evaluate", "walk.gauge.pt", *flat)
+    assert done.exit_code == 0 and "results/walk-tiny-stress-2/results.json" in done.stdout.replace("\n", "")
+    assert (tmp_path / "results/walk-tiny-stress/results.json").read_bytes() == before
+
+
+def test_one_seed_is_said_before_anything_is_played(run, refused, tmp_path, policy, tiny):
+    """``compare --suite demo`` played for three minutes, and then could not tell."""
+    (tmp_path / "copy.gauge.pt").write_bytes(policy.read_bytes())
+    sentence = refused("compare", policy, "copy.gauge.pt", "--suite", tiny, "--seed", 1)
+    assert sentence.startswith(
+        "seed 1 is the only one, which tells no difference from chance; compare with three seeds"
+    )
+    assert not (tmp_path / "results").exists()

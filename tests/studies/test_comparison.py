@@ -9,9 +9,12 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from gaitgauge.gauge.request import Request
 from gaitgauge.gauge.result import Coverage, Provenance, Run, SuiteName
 from gaitgauge.studies.compare.comparison import ComparisonError, compare, holm, load_result
+from gaitgauge.studies.compare.contestants import deciding_request
 from gaitgauge.studies.compare.report import as_csv, as_latex, as_page, write_comparison
+from gaitgauge.studies.interval_charts import common_scale
 from sample_results import sample
 
 SCORE_CARDS = Path(__file__).parents[2] / "docs" / "data" / "scorecards"
@@ -90,7 +93,7 @@ def test_versions_source_and_solver_that_differ_are_said():
 
 def test_everything_that_the_issue_names_is_compared():
     kinds = {d.kind for d in compare(both()).differences}
-    assert kinds == {"score", "level", "group", "terrain", "friction", "metric", "command"}
+    assert kinds == {"score", "level", "group", "terrain", "friction", "metric", "metric as measured", "command"}
     swept = compare(both(suite="gaitgauge-1", terrains=("flat", "wave"))).differences
     assert [d.name for d in swept if d.kind == "payload"] == ["-1", "0", "1", "2", "3"]
     assert [d.name for d in swept if d.kind == "friction"] == [f"0.{n}" for n in range(2, 10)] + ["1"]
@@ -140,7 +143,7 @@ def test_metrics_are_compared_where_both_reached_one_level():
     flat = first.environments[0]
     found = {(d.kind, d.name): d for d in compare([first, second]).differences}
     runs = [run.columns["dof_power"] for run in flat.runs.values()]
-    assert found["metric", "dof_power"].values[0] == pytest.approx(np.mean(runs), abs=1e-6)
+    assert found["metric as measured", "dof_power"].values[0] == pytest.approx(np.mean(runs), abs=1e-6)
 
 
 def test_metrics_are_compared_at_a_whole_level_that_both_were_measured_at():
@@ -160,10 +163,10 @@ def test_metrics_are_compared_at_a_whole_level_that_both_were_measured_at():
 
     first, other = measured(first, 5, 0.0), measured(second, 6, 0.1)
     found = {(d.kind, d.name): d for d in compare([first, other]).differences}
-    assert found["metric", "dof_power"].values == pytest.approx((6.0, 6.1))
+    assert found["metric as measured", "dof_power"].values == pytest.approx((6.0, 6.1))
     assert found["level", "mean level"].difference == pytest.approx(1.0)
     other = measured(second, 7, 0.1)
-    assert not [d for d in compare([first, other]).differences if d.kind in ("metric", "command")]
+    assert not [d for d in compare([first, other]).differences if d.kind in ("metric as measured", "command")]
 
 
 @pytest.mark.parametrize("suite", ["robogauge-1.1", "gaitgauge-1"])
@@ -345,6 +348,58 @@ def test_score_cards_that_ship_can_be_compared(suite, names):
     found = compare([card for card in cards if card.robot == "go2"])
     assert len(found.policies) >= 2
     assert next(d for d in found.differences if d.kind == "score").real
+
+
+def test_a_metric_is_the_figure_that_evaluate_shows():
+    """The page had a mean of the same name and another weighting."""
+    pair = both(frictions=(0.6, 0.9))
+    found = compare(pair)
+    weighted = {d.name: d.values for d in found.differences if d.kind == "metric"}
+    assert weighted == {name: tuple(round(r.metrics[name].mean50, 6) for r in pair) for name in pair[0].metrics}
+    measured = {d.name: d.values for d in found.differences if d.kind == "metric as measured"}
+    assert measured.keys() == weighted.keys() and measured != weighted  # without the weight of the level
+    assert "<th>metric as measured</th>" in as_page(found)
+
+
+def test_axes_have_a_size_and_heads_have_room():
+    """Axes of equal policies went from -1e-06 to 1e-06, and a head was cut off."""
+    page = as_page(compare(both()))
+    assert "e−0" not in page and ">−0.001<" in page and ">0.001<" in page
+    assert page.count('<th class="odds">corrected p</th>') == page.count("<th>p</th>")
+    assert common_scale([{"value": 1e-9, "interval": (0.0, 2e-9)}], signed=False) == (0.0, 1e-3)
+    assert common_scale([{"value": 0.03, "interval": (0.0, 0.04)}], signed=True) == (-0.05, 0.05)
+
+
+@pytest.mark.parametrize(
+    ("choices", "outcome"),
+    [
+        ({"suite": "demo"}, (0, 1, 2)),
+        ({"suite": "demo", "seeds": (4, 5)}, (4, 5)),
+        ({"suite": "gaitgauge-1"}, ()),  # its own three
+        ({"suite": "demo", "seeds": (4,)}, "seed 4 is the only one"),
+        ({"suite": "gaitgauge-1", "pipeline": "base"}, "pipeline 'base' plays one seed"),
+    ],
+)
+def test_seeds_that_decide_nothing_are_not_played(choices, outcome):
+    said = []
+    request = Request(policy="a.pt", **choices)
+    if isinstance(outcome, str):
+        with pytest.raises(ComparisonError, match=f"{outcome}.*, which tells no difference from chance; "):
+            deciding_request(request, said.append)
+        return
+    assert deciding_request(request, said.append).seeds == outcome
+    added = (
+        "suite 'demo' has one seed, which tells no difference from chance: every policy is played with seeds 0, 1 and 2"
+    )
+    assert said == ([added] if outcome == (0, 1, 2) else [])
+
+
+def test_a_comparison_never_gets_the_folder_of_another_one(tmp_path):
+    whole, other = compare(both()), compare(both(frictions=(0.6,)))
+    usual = tmp_path / "compare-a-b"
+    homes = [write_comparison(usual, found, overwrite=False)["json"].parent for found in (whole, other, whole)]
+    assert homes == [usual, tmp_path / "compare-a-b-2", usual]
+    assert write_comparison(usual, other)["json"].parent == usual  # asked for
 
 
 def test_details_are_named_once():

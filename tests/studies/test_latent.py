@@ -16,6 +16,7 @@ from gaitgauge.policy.native import StoredNetwork, save_policy
 from gaitgauge.policy.networks.architectures import ARCHITECTURES
 from gaitgauge.robots import load_robot
 from gaitgauge.studies.latent.collecting import SPREAD, Notes, collect, start
+from gaitgauge.studies.latent.figures import _colour
 from gaitgauge.studies.latent.request import LatentRequest
 from gaitgauge.studies.latent.separation import principal_components, separation, silhouette
 from gaitgauge.studies.latent.study import LatentError, _blocks, _experts, look, study_latents
@@ -276,3 +277,9 @@ def test_one_sentence_where_there_is_nothing_to_look_at(policies, tmp_path):
     with pytest.raises(ValueError, match="friction 0 is not possible"):
         study_latents(LatentRequest(policies=("pretrained",), friction=0.0), tmp_path)
     assert not list(tmp_path.iterdir())
+
+
+def test_every_class_has_a_colour_of_its_own():
+    """From the ninth terrain on, colours of the legend repeated."""
+    colours = [_colour(index) for index in range(40)]
+    assert len(set(colours)) == 40

@@ -3,7 +3,8 @@
 from pathlib import Path
 
 import pytest
-from gaitgauge.studies.naming import distinct_names, joined_names, run_folders
+from gaitgauge.gauge.store import RunFolder
+from gaitgauge.studies.naming import distinct_names, free_run_folder, joined_names, run_folders
 
 KEPT = "sweeps/baselines/runs/{}/seed-{}/kept/policy.gauge.pt"
 
@@ -63,3 +64,30 @@ def test_studies_of_other_policies_have_other_folders():
     four = ["a.pt", "b.pt", "c.pt", "d.pt"]
     assert joined_names(four) != joined_names([*four[:3], "e.pt"])
     assert len(joined_names([f"{i}/{'x' * 70}.pt" for i in range(50)])) < 200
+
+
+def test_latest_is_called_by_the_checkpoint_that_it_stands_for(tmp_path, monkeypatch):
+    """The next training changes it: two evaluations of ``latest`` had one folder, and the second was refused."""
+    monkeypatch.chdir(tmp_path)
+    usual = {"suite": "demo", "pipeline": "stress"}
+    assert run_folders(["latest"], Path("results"), **usual) == [Path("results/latest-demo-stress")]  # there is none
+    run = tmp_path / "logs/rsl_rl/walking/2026-11-24_tall"
+    run.mkdir(parents=True)
+    for iteration in (50, 100):
+        (run / f"model_{iteration}.pt").touch()
+        named = f"2026-11-24_tall-model_{iteration}"
+        assert run_folders(["latest"], Path("results"), **usual) == [Path(f"results/{named}-demo-stress")]
+        assert joined_names(["latest", "a.pt"]) == f"{named}-a"
+
+
+def test_a_run_never_gets_the_folder_of_another_one(tmp_path):
+    usual, runs = tmp_path / "walk-demo-stress", [("engine", {"seeds": [seed]}) for seed in range(3)]
+    for run, name in zip(runs, ("", "-2", "-3"), strict=True):
+        folder = free_run_folder(usual, run)
+        assert folder == tmp_path / f"walk-demo-stress{name}"
+        with RunFolder(folder / "engine", run[1], resume=False):
+            (folder / "engine" / "episodes" / "x.npz").touch()
+    assert free_run_folder(usual, runs[1]) == tmp_path / "walk-demo-stress-2"  # its own, to go on with
+    (tmp_path / "notes").mkdir()
+    (tmp_path / "notes" / "mine.txt").touch()
+    assert free_run_folder(tmp_path / "notes", ("", runs[0][1])) == tmp_path / "notes-2"
