@@ -59,19 +59,22 @@ def compare_all(
     if len(contestants) < 2:
         raise ComparisonError(f"a comparison needs at least two policies or results; only '{contestants[0]}' was given")
     found = {c: load_result(Path(c)) for c in contestants if is_result(c)}
+    added: list[str] = []
     if len(found) < len(contestants):
         lone = [c for c, result in found.items() if len(result.chance.seeds) == 1]
         if lone:
             raise ComparisonError(
                 f"the results of '{lone[0]}' have one seed, {_TELLS_NOTHING}; evaluate its policy again {_ADVICE}"
             )
-        request = deciding_request(request, say)
+        request = deciding_request(request, added.append)
     requests = {
         c: replace(request, policy=c, contract=own_contract(c, request.contract)) for c in contestants if c not in found
     }
     prepared_requests = {c: prepare(wanted) for c, wanted in requests.items()}
     check_different([found.get(c) or find_policy(c).resolve() for c in contestants], contestants)
     check_alike([found.get(c) or _known_before(prepared_requests[c]) for c in contestants], contestants)
+    for sentence in added:  # nothing else is wrong
+        say(sentence)
     names: Any = {"suite": request.suite, "pipeline": request.pipeline, "parameters": request.parameters}
     usual = run_folders(list(requests), runs, **names)
     folders = [
