@@ -66,7 +66,9 @@ def test_another_policy_s_trial_is_not_overwritten(run, refused, policy, contrac
     other = replace(contract, provenance={"kind": "another"})
     save_policy(tmp_path / "one" / "HIM" / "kept" / "policy.gauge.pt", other, stored)
     before = (tmp_path / "results" / "trial-HIM" / "trials.json").read_text()
-    sentence = refused("trial", "one/HIM/kept/policy.gauge.pt", *trial)
+    assert run("trial", "one/HIM/kept/policy.gauge.pt", *trial).exit_code == 0
+    assert {p.name for p in (tmp_path / "results").iterdir()} == {"trial-HIM", "trial-HIM-2", "trial-CTS"}
+    sentence = refused("trial", "one/HIM/kept/policy.gauge.pt", *trial, "--out", "results/trial-HIM")
     assert "'results/trial-HIM' holds policy 'HIM' (two/HIM/kept/policy.gauge.pt)" in sentence
     assert "give another folder with --out" in sentence
     assert (tmp_path / "results" / "trial-HIM" / "trials.json").read_text() == before
