@@ -312,8 +312,9 @@ class SequentialBackend(PhysicsBackend):
         if points:
             center = np.mean(points, axis=0)
             out["contact_center_w"][row], out["contact_count"][row] = center, len(points)
-            moments = [np.cross(each.point_w - center, each.force_w) + each.moment_w for each in found]
-            out["ground_moment_w"][row] = np.sum(moments, axis=0)
+            arms = np.array([each.point_w for each in found]) - center
+            moments = np.cross(arms, [each.force_w for each in found]).sum(axis=0)
+            out["ground_moment_w"][row] = moments + sum(each.moment_w for each in found)
 
     def randomize(self, randomization: Randomization, worlds: torch.Tensor | None = None) -> None:
         """See ``PhysicsBackend.randomize``."""
@@ -366,11 +367,13 @@ class SequentialBackend(PhysicsBackend):
         check_force(self.scene, force_w)
         self._force[:] = force_w.numpy()
 
-    def describe(self) -> Mapping[str, list[float]]:
+    def describe(self) -> Mapping[str, list[float]] | None:
         """See ``PhysicsBackend.describe``."""
+        if not (constants := self._worlds[0].constants()):
+            return None
         factors = {name: values[0] for name, values in self._motors.items()}
         strength = factors["motor_strength"]
-        passive = {"joint_friction_loss": self._dry} | self._worlds[0].constants()
+        passive = {"joint_friction_loss": self._dry} | constants
         return ModelFields(
             stiffness=self._kp * factors["stiffness_scale"] * strength,
             damping=self._kd * factors["damping_scale"] * strength,

@@ -87,9 +87,9 @@ class World(ABC):
     def change(self, changes: Mapping[str, Array]) -> None:
         """Write fields of ``Randomization`` by name into the model, from its nominal values; fields that are missing are nominal."""
 
-    @abstractmethod
     def constants(self) -> dict[str, Any]:
-        """Return the fields of ``ModelFields`` as the engine holds them, without the motors' gains and limits."""
+        """Return the fields of ``ModelFields`` as the engine holds them, without the motors' gains and limits; nothing where unknown."""
+        return {}
 
     def close(self) -> None:  # noqa: B027  (an engine may have nothing to free)
         """Free the world."""

@@ -14,7 +14,7 @@ EXAMPLE = Path(__file__).parents[2] / "examples" / "plugin_backend"
 CHECKS = {check.name: check for check in all_checks()}
 SHORT = ("reset/", "motors/")
 """Checks that a guide shows; all others are slow tests, as the engine below is that of the conformance tests."""
-NOT_SUPPORTED = {"health/penetration_watch", "model/link_mass", "model/link_mass_motion"}
+NOT_SUPPORTED = {"contact/foot_change"}
 
 
 @pytest.fixture(scope="module")
