@@ -18,8 +18,8 @@ from ..files.parsing import build, one_line, parse_json
 from .apart import run_apart
 from .base import JointParameters
 from .checking import compiled
-from .examining import stand_still
 from .loading import RobotError
+from .standing import MOST_SAG, stand_still
 from .surveying import GRAVITY, Remarked, Survey
 
 _CLEARANCE = 0.02
@@ -27,8 +27,8 @@ _CLEARANCE = 0.02
 _GUESSED = "guessed"
 _STIFFER = (1.0, 2.0, 4.0, 8.0)
 """Factors of the guessed stiffness that are tried in turn."""
-_LOWEST, _MOST_TILT = 0.75, 0.2
-"""Smallest share of its height and largest tilt [rad] of a robot that stands with a guessed stiffness; ``robot check`` allows more."""
+_MOST_TILT = 0.2
+"""Largest tilt [rad] of a robot that stands with a guessed stiffness; ``robot check`` allows more."""
 _LINE = 100
 """Longest line of a list [characters]."""
 
@@ -64,7 +64,7 @@ class Draft:
         lines = [
             f"# A first description of {self.name}, made from its model: go through what is guessed. SI units and radians.",
             "# A value per joint is one number for all joints, a list in the order of `joint_names`, or a table whose keys",
-            "# are joint names or their endings. docs/guides/your-robot.md explains every key.",
+            "# are joint names or words of them. docs/guides/your-robot.md explains every key.",
             "",
         ]
         table = ""
@@ -159,8 +159,9 @@ def _standing_motors(
         constants: dict[str, Any] = {
             key: tuple(np.broadcast_to(value, len(joints)).tolist()) for key, (value, _) in motors.items()
         }
-        stances.append(stand_still(survey.spec.copy(), angles, JointParameters(**constants), height))
-        if stances[-1].stands(lowest=_LOWEST, most_tilt=_MOST_TILT):
+        held = len(survey.legs) == 2  # two legs fall over whatever their stiffness
+        stances.append(stand_still(survey.spec.copy(), angles, JointParameters(**constants), height, upright=held))
+        if stances[-1].stands(lowest=1.0 - MOST_SAG * length / height, most_tilt=_MOST_TILT):
             if stiffer > 1.0:
                 raised = f"{remark}, and raised from {guess:g}, with which it does not stand well"
                 motors["stiffness"] = (motors["stiffness"][0], raised)

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import json
-import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from functools import partial
 from typing import TYPE_CHECKING
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..files.parsing import build, parse_json
+from .anatomy import WORDS, anatomy
 from .apart import run_apart
 from .base import JointParameters, Robot
 from .body_plan import (
@@ -27,18 +27,12 @@ from .checking import DEPTH_TOLERANCE, ModelChecks
 from .feet import shank_end
 from .limbs import joint_chain
 from .loading import RobotError
+from .standing import balance, folded, sag, stand
 
 if TYPE_CHECKING:
     import mujoco
 
-STANDING_SECONDS = 2.0
-"""Duration of standing [s]."""
-_TIMESTEP = 0.002
 _TRAINING_TIMESTEP = 0.005
-_MOST_TILT = 0.3
-"""Largest tilt of a standing robot [rad]."""
-_LOWEST = 0.7
-"""Smallest height of a standing robot, as a share of its first one."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,7 +74,12 @@ def _findings(robot: Robot) -> str:
         note("legs", partial(_legs, robot))
         note("foot shapes", partial(_foot_shapes, robot), "what is rewarded and judged of feet")
         note("parts", partial(_parts, robot), "a start at rest")
-        note("standing", partial(stand, robot))
+        note("pose", partial(folded, robot))
+        note("load", partial(sag, robot), "standing as the default pose says")
+        two = len(robot.foot_names) == 2
+        note(
+            "standing", partial(balance if two else stand, robot), "standing without a policy" if two else "everything"
+        )
         note("mirror image", partial(_mirror, robot), "training with symmetry")
         note("joint ranges", partial(_ranges, robot), "the metric dof_limits and the reward joint_limits")
         note("motor law", partial(_motor_law, robot), "training, whose physics steps 5 ms")
@@ -90,21 +89,25 @@ def _findings(robot: Robot) -> str:
 
 
 def _legs(robot: Robot) -> str:
-    plan = body_plan(robot)
-    legs = f"{len(plan.legs)} legs of {plan.leg_length:.3f} m, {len(plan.abduction)} of them with a joint that swings it sideways"
-    return f"{legs}; the base stands {plan.standing_height:.3f} m high in the default pose"
+    plan, build = body_plan(robot), anatomy(robot)
+    legs = f"{len(plan.legs)} legs of {plan.leg_length:.3f} m ({', '.join(leg.name for leg in build.legs)})"
+    others = sorted({role.partition("_")[0] for role in build.roles} - {"hip", "knee", "ankle"})
+    rest = f", joints of {', '.join(others)}" if others else ""
+    return f"{WORDS[build.plan]}: {legs}{rest}; the base stands {plan.standing_height:.3f} m high in the default pose"
 
 
 def _foot_shapes(robot: Robot) -> str:
     """Check that the centre of a foot's shape, which is the foot's position, is not in the middle of a shank."""
     model, data = default_pose(robot)
-    base, heights = model.body(robot.base_body).id, []
+    base, heights, roles = model.body(robot.base_body).id, [], anatomy(robot).roles
+    order = {model.joint(name).id: i for i, name in enumerate(robot.joint_names)}
     for name, sole, center in zip(
         robot.foot_names, sole_geoms(model, robot), foot_centers(model, data, robot), strict=True
     ):
         heights.append(float(center[2]) - min(lowest_point(model, data, geom) for geom in sole))
         chain = joint_chain(model, int(model.geom_bodyid[sole[0]]), base)
-        end = shank_end(model, data, sole[0], data.xanchor[chain[-1]]) if chain and len(sole) == 1 else None
+        knee = bool(chain) and len(sole) == 1 and roles[order[chain[-1]]] == "knee"
+        end = shank_end(model, data, sole[0], data.xanchor[chain[-1]]) if knee else None
         if end is not None:
             raise RobotError(
                 f"the foot '{name}' is {end.length:.3g} m long: its centre, which counts as the foot's position, is {heights[-1]:.3f} m "
@@ -134,101 +137,6 @@ def _part(model: mujoco.MjModel, geom: int) -> str:
     name, body = model.geom(geom).name, model.body(int(model.geom_bodyid[geom]))
     shape = f"the geom '{name}'" if name else "a geom"
     return f"{shape} of the body '{body.name or body.id}'"
-
-
-def stand(robot: Robot) -> str:
-    """Let a robot stand in its default pose with the gains of its default parameters, and describe its stance.
-
-    Its parts meet, as in training and in the suites.
-
-    Raises:
-        RobotError: the robot falls, sinks or flies apart.
-    """
-    import mujoco
-
-    stance = stand_still(
-        mujoco.MjSpec.from_file(str(robot.mjcf)),
-        dict(zip(robot.joint_names, robot.default_joint_position, strict=True)),
-        robot.parameters[robot.default_parameters],
-        body_plan(robot).standing_height,
-    )
-    if stance.apart_after is not None:
-        raise RobotError(
-            f"robot '{robot.name}': it flies apart within {stance.apart_after:.2f} s of standing; lower stiffness and damping of "
-            f"parameters.{robot.default_parameters}, or give its joints armature"
-        )
-    if not stance.stands():
-        raise RobotError(
-            f"robot '{robot.name}': it does not stand: {stance}; raise the stiffness and torque_limit of "
-            f"parameters.{robot.default_parameters}, or mend default_joint_position"
-        )
-    return f"stands in its default pose: {stance}, with up to {100 * stance.torque:.0f} % of a motor's torque"
-
-
-@dataclass(frozen=True, kw_only=True)
-class Stance:
-    """Stance of a robot that was left standing in a pose."""
-
-    height: float
-    """Of its base at the end [m]."""
-    start: float
-    """Of its base at the beginning [m]."""
-    tilt: float
-    """Of its base at the end [rad]."""
-    torque: float
-    """Largest share of a motor's torque limit at the end."""
-    apart_after: float | None = None
-    """Time at which the robot flew apart [s]; None where it did not."""
-
-    def stands(self, *, lowest: float = _LOWEST, most_tilt: float = _MOST_TILT) -> bool:
-        """Return whether the robot is whole, at least ``lowest`` of its first height high, and tilted by ``most_tilt`` [rad] at most."""
-        return self.apart_after is None and self.tilt <= most_tilt and self.height >= lowest * self.start
-
-    def __str__(self) -> str:
-        return f"after {STANDING_SECONDS:g} s its base is {self.height:.3f} m high and leans by {self.tilt:.2f} rad"
-
-
-def stand_still(spec: mujoco.MjSpec, pose: Mapping[str, float], motors: JointParameters, height: float) -> Stance:
-    """Leave a robot standing on level ground.
-
-    Args:
-        spec: the robot alone; ground is added, and its actuators are switched off.
-        pose: the angle that each joint is to keep [rad].
-        motors: of the joints, in the order of ``pose``.
-        height: of the base at the beginning [m].
-    """
-    import mujoco
-
-    spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_ACTUATION)  # sensors may refer to actuators: they stay
-    spec.option.timestep = _TIMESTEP
-    spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], contype=1, conaffinity=1)
-    model = spec.compile()
-    data = mujoco.MjData(model)
-    joints = [model.joint(name).id for name in pose]
-    at_q, at_v = model.jnt_qposadr[joints], model.jnt_dofadr[joints]
-    model.dof_armature[at_v] = motors.armature
-    model.dof_damping[at_v] = motors.joint_damping
-    model.dof_frictionloss[at_v] = motors.friction_loss
-    mujoco.mj_setConst(model, data)
-    angles, limit = np.array(list(pose.values())), np.array(motors.torque_limit)
-    data.qpos[:7] = (0.0, 0.0, height, 1.0, 0.0, 0.0, 0.0)
-    data.qpos[at_q] = angles
-    apart_after = None
-    for _ in range(round(STANDING_SECONDS / _TIMESTEP)):
-        torque = np.multiply(motors.stiffness, angles - data.qpos[at_q]) - np.multiply(motors.damping, data.qvel[at_v])
-        data.qfrc_applied[at_v] = np.clip(torque, -limit, limit)
-        mujoco.mj_step(model, data)
-        if not np.isfinite(data.qpos).all() or data.warning[mujoco.mjtWarning.mjWARN_BADQACC].number:
-            apart_after = float(data.time)
-            break
-    _, x, y, _ = data.qpos[3:7]
-    return Stance(
-        height=float(data.qpos[2]),
-        start=height,
-        tilt=math.acos(max(-1.0, min(1.0, 1.0 - 2.0 * (x * x + y * y)))),
-        torque=float(np.max(np.abs(data.qfrc_applied[at_v]) / np.maximum(limit, 1e-9))),
-        apart_after=apart_after,
-    )
 
 
 def _mirror(robot: Robot) -> str:

@@ -2,8 +2,8 @@
 
 The file's keys are the fields of ``Robot`` and, in ``[parameters.NAME]`` tables, of ``JointParameters``; keys with a default may
 be absent. ``mjcf`` is relative to the file. A value per joint is one number for all joints, a list in the order of
-``joint_names``, or a table by joint names or their endings (``calf`` fits ``FL_calf`` and ``FL_calf_joint``); the longest
-fitting key wins.
+``joint_names``, or a table by joint names or whole words of them (``calf`` fits ``FL_calf_joint``, ``hip`` fits
+``left_hip_roll_joint``); the longest fitting key wins. A parameter set may begin with another one: ``like = "gauge"``.
 """
 
 from __future__ import annotations
@@ -67,6 +67,7 @@ def load_robot_file(path: str | Path) -> Robot:
         sets = data.get("parameters")
         for name, table in sets.items() if isinstance(sets, dict) else ():
             if isinstance(table, dict):
+                _begin_like(table, sets, f"{source}: parameters.{name}")
                 _place_network(table, file.parent)
                 _spread(table, PER_JOINT, names, f"{source}: parameters.{name}")
     elif isinstance(names, list):
@@ -76,6 +77,18 @@ def load_robot_file(path: str | Path) -> Robot:
     robot = build(Robot, data, source, RobotError)
     _check(robot, source)
     return robot
+
+
+def _begin_like(table: dict[str, Any], sets: dict[str, Any], where: str) -> None:
+    """Fill a parameter set up with the values of the set that its ``like`` names, which stands before it in the file."""
+    if (like := table.pop("like", None)) is None:
+        return
+    earlier = list(sets)[: next(i for i, other in enumerate(sets.values()) if other is table)]
+    if like not in earlier:
+        choice = f"choose from {', '.join(earlier)}" if earlier else "no set stands before it"
+        raise RobotError(f"{where}.like is {shown(like)}, which is no parameter set before it; {choice}")
+    for key, value in sets[like].items():
+        table.setdefault(key, value)
 
 
 def _place_network(table: dict[str, Any], folder: Path) -> None:
@@ -248,33 +261,33 @@ def _elements(file: Path, copies: float) -> list[_Element]:
 
 
 def _spread(table: dict[str, Any], keys: Any, joints: list[str], where: str) -> None:
-    """Expand single values, and tables by the ending of joint names, to one value per joint."""
+    """Expand single values, and tables by the words of joint names, to one value per joint."""
     for key in keys:
         value = table.get(key)
         if isinstance(value, dict):
-            table[key] = _by_ending(value, joints, f"{where}.{key}" if "parameters" in where else f"{where}: {key}")
+            table[key] = _by_key(value, joints, f"{where}.{key}" if "parameters" in where else f"{where}: {key}")
         elif value is not None and not isinstance(value, list):
             table[key] = [value] * len(joints)
 
 
-def _by_ending(table: Mapping[str, Any], joints: list[str], where: str) -> list[Any]:
-    for ending in table:
-        if not any(_fits(ending, joint) for joint in joints):
-            hint = did_you_mean(ending, [j.removesuffix(_JOINT_ENDING) for j in joints])
-            unknown = f"the key {shown(ending)}, which is neither a joint nor a joint's ending{hint}"
+def _by_key(table: Mapping[str, Any], joints: list[str], where: str) -> list[Any]:
+    for key in table:
+        if not any(_fits(key, joint) for joint in joints):
+            hint = did_you_mean(key, [j.removesuffix(_JOINT_ENDING) for j in joints])
+            unknown = f"the key {shown(key)}, which is neither a joint nor words of its name{hint}"
             raise RobotError(f"{where} has {unknown}")
     values = []
     for joint in joints:
-        fitting = [ending for ending in table if _fits(ending, joint)]
+        fitting = [key for key in table if _fits(key, joint)]
         if not fitting:
-            raise RobotError(f"{where} has no value for the joint {shown(joint)}; add its name or an ending of it")
+            raise RobotError(f"{where} has no value for the joint {shown(joint)}; add its name or words of it")
         values.append(table[max(fitting, key=len)])
     return values
 
 
-def _fits(ending: str, joint: str) -> bool:
-    """Return whether a key stands for the joint: the name or whole words at its end, with or without ``_joint``."""
-    return any(name == ending or name.endswith("_" + ending) for name in (joint, joint.removesuffix(_JOINT_ENDING)))
+def _fits(key: str, joint: str) -> bool:
+    """Return whether a key stands for the joint: the name, or whole words of it."""
+    return f"_{key}_" in f"_{joint}_"
 
 
 def _check(robot: Robot, source: str) -> None:

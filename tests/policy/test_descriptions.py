@@ -201,7 +201,7 @@ def test_rl_sars_policy_of_two_inputs(tmp_path):
     [
         (
             {"name": "lite3/himloco"},
-            "describes a policy for robot 'lite3', which is not installed (there are anymal_c, go1, go2, go2w)",
+            "describes a policy for robot 'lite3', which is not installed (there are anymal_c, g1, go1, go2",
         ),
         ({"wheels": "[3]"}, "drives joints by velocity (FR_hip_joint), as wheels are"),
         (

@@ -6,6 +6,7 @@ import mujoco
 import pytest
 from gaitgauge.robots import RobotError, load_robot
 from gaitgauge.robots.anatomy import anatomy, plan_of
+from gaitgauge.robots.body_plan import body_plan
 from gaitgauge.robots.limbs import joint_chain, joint_roles, moving_tips
 from stick_biped import write_biped
 
@@ -57,3 +58,17 @@ def test_joints_that_are_not_driven_are_held():
     assert [(j.name, j.position, j.stiffness, j.damping) for j in robot.held] == [
         (f"{leg}_hip_joint", angle, 20.0, 0.5) for leg, angle in (("FL", 0.1), ("FR", -0.1), ("RL", 0.1), ("RR", -0.1))
     ]
+
+
+def test_the_g1_is_the_makers():
+    """Mass of the maker's model of 29 joints, rev 1.0; length of the stretched leg from its link lengths, by hand."""
+    g1 = load_robot("g1")
+    build = anatomy(g1)
+    assert build.plan == "humanoid" and [leg.name for leg in build.legs] == ["left", "right"]
+    assert [build.roles[i] for i in build.legs[0].joints] == [
+        n.removeprefix("left_").removesuffix("_joint") for n in g1.joint_names[:6]
+    ]
+    assert all(role in name for role, name in zip(build.roles, g1.joint_names, strict=True))
+    assert body_plan(g1).mass == pytest.approx(33.341, abs=1e-3)
+    assert build.leg_length == pytest.approx(0.69, abs=0.01)
+    assert g1.sdk_joint_names == g1.joint_names

@@ -53,7 +53,7 @@ def test_go2_parameter_sets():
 
 
 def test_own_robots_are_named_as_their_folders():
-    assert {"go1", "go2", "anymal_c"} <= set(robot_names())
+    assert {"go1", "go2", "anymal_c", "g1"} <= set(robot_names())
     for name in robot_names():
         assert load_robot(name).name == name
 
@@ -124,7 +124,7 @@ def test_longest_key_wins(write_hopper):
             "armature = 0.01\ndriving_torque_limit = 41",
             "driving_torque_limit is 41 N·m for hip but must not be above torque_limit, 40",
         ),
-        ("knee = 2.0", "ankle = 2.0", "'ankle', which is neither a joint nor a joint's ending"),
+        ("knee = 2.0", "ankle = 2.0", "'ankle', which is neither a joint nor words of its name"),
         ("knee = 2.0", "left_kne = 2.0", "did you mean 'left_knee'?"),
         (", knee = 2.0", "", "no value for the joint 'left_knee_joint'"),
         ("[0.3, -0.6]", "[0.3]", "default_joint_position has 1 values but there are 2 joints"),
@@ -171,7 +171,7 @@ def test_missing_and_unreadable_files(tmp_path):
 def test_unknown_name_offers_close_ones():
     with pytest.raises(RobotError, match=r"unknown robot 'g02'; did you mean 'go2'\?"):
         load_robot("g02")
-    with pytest.raises(RobotError, match=r"unknown robot 'elephant' \(installed: anymal_c, go1, go2"):
+    with pytest.raises(RobotError, match=r"unknown robot 'elephant' \(installed: anymal_c, g1, go1, go2"):
         load_robot("elephant")
 
 
@@ -310,3 +310,20 @@ def test_a_binary_in_the_place_of_the_model(write_hopper):
     (path.parent / "model" / "hopper.xml").write_bytes(bytes(range(256)) * 10)
     with pytest.raises(RobotError, match="is not XML"):
         load_robot(path)
+
+
+def test_a_parameter_set_may_begin_with_another(write_hopper):
+    more = '[parameters.stiff]\nlike = "soft"\nstiffness = 90.0\n'
+    path = write_hopper()
+    path.write_text(path.read_text() + more)
+    sets = load_robot(path).parameters
+    assert sets["stiff"] == replace(sets["soft"], stiffness=(90.0, 90.0))
+    path.write_text(path.read_text().replace('like = "soft"', 'like = "stiff"'))
+    with pytest.raises(RobotError, match=r"parameters.stiff.like is 'stiff', .* before it; choose from soft$"):
+        load_robot(path)
+
+
+def test_keys_are_words_of_joint_names():
+    g1 = load_robot("g1")
+    hips = {n: kp for n, kp in zip(g1.joint_names, g1.parameters["gauge"].torque_limit, strict=True) if "hip" in n}
+    assert hips == {n: 139.0 if "roll" in n else 88.0 for n in hips}
