@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from .base import Robot
 from .body_plan import body_plan, default_pose, foot_centers
-from .limbs import joint_roles
+from .limbs import joint_chain, joint_roles
 from .loading import RobotError
 
 Plan = Literal["quadruped", "biped", "humanoid", "wheeled", "hexapod"]
@@ -61,14 +61,15 @@ class Anatomy:
 def anatomy(robot: Robot) -> Anatomy:
     """Read a robot's build off its model and feet; raise ``RobotError`` where no body plan fits."""
     sizes = body_plan(robot)
-    legs = sizes.legs
     model, data = default_pose(robot)
     order = {model.joint(name).id: i for i, name in enumerate(robot.joint_names)}
     ids = {i: joint for joint, i in order.items()}
     feet = [model.geom(sole[0]).id for sole in robot.soles]
     base = model.body(robot.base_body).id
-    chains = [[ids[i] for i in leg] for leg in legs]
-    roles = joint_roles(model, base, chains, feet)
+    chains = [joint_chain(model, int(model.geom_bodyid[foot]), base) for foot in feet]
+    legs = [tuple(order[j] for j in chain) for chain in chains]
+    wheels = {model.joint(name).id for name in robot.velocity_joints or ()}
+    roles = joint_roles(model, base, chains, feet, wheels)
     who = f"robot '{robot.name}'"
     plan = plan_of(len(legs), roles.values(), who)
     return Anatomy(

@@ -64,7 +64,7 @@ class Draft:
         lines = [
             f"# A first description of {self.name}, made from its model: go through what is guessed. SI units and radians.",
             "# A value per joint is one number for all joints, a list in the order of `joint_names`, or a table whose keys",
-            "# are joint names or words of them. docs/guides/your-robot.md explains every key.",
+            "# are joint names or words of them. docs/reference/robot-file.md explains every key.",
             "",
         ]
         table = ""

@@ -6,7 +6,7 @@ about y is a pitch joint, about x roll, about z yaw.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,13 +22,16 @@ _ON_AXIS = 0.2
 _TURN = 2.0 * np.pi
 
 
-def joint_roles(model: mujoco.MjModel, base: int, legs: Sequence[Sequence[int]], feet: Sequence[int]) -> dict[int, str]:
+def joint_roles(
+    model: mujoco.MjModel, base: int, legs: Sequence[Sequence[int]], feet: Sequence[int], wheels: Container[int] = ()
+) -> dict[int, str]:
     """Return the role of each joint that moves something against the base, by MuJoCo's number of the joint.
 
     Args:
         base: body with the free joint.
         legs: joints of each leg from the base outwards.
         feet: a geom of each leg's foot.
+        wheels: joints known to turn wheels; others are told by their shapes.
     """
     import mujoco
 
@@ -49,7 +52,8 @@ def joint_roles(model: mujoco.MjModel, base: int, legs: Sequence[Sequence[int]],
     roles = {joint: f"waist_{axis[joint]}" for joint in waist}
     for leg, foot in zip(legs, feet, strict=True):
         own = [j for j in leg if j not in waist]
-        roles |= _leg_roles(model, data, own, foot, axis)
+        turning = {j for j in own[-1:] if j in wheels or is_wheel(model, data, j, foot)}
+        roles |= dict.fromkeys(turning, "wheel") | _leg_roles(data, [j for j in own if j not in turning], axis)
     limbs: dict[int, list[list[int]]] = {}
     for chain in chains:
         own = [j for j in chain if j not in waist]
@@ -93,13 +97,8 @@ def pitch_joints(data: mujoco.MjData, leg: Sequence[int]) -> list[int]:
     return across if len(across) > 1 else list(leg[1:]) or list(leg)
 
 
-def _leg_roles(
-    model: mujoco.MjModel, data: mujoco.MjData, leg: Sequence[int], foot: int, axis: Mapping[int, str]
-) -> dict[int, str]:
+def _leg_roles(data: mujoco.MjData, leg: Sequence[int], axis: Mapping[int, str]) -> dict[int, str]:
     roles = {}
-    if leg and is_wheel(model, data, leg[-1], foot):
-        roles[leg[-1]] = "wheel"
-        leg = leg[:-1]
     bends = pitch_joints(data, leg)
     knees = bends[1:2] if len(bends) < 4 else bends[1:-1]
     for place, joint in enumerate(leg):

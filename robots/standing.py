@@ -11,7 +11,7 @@ import numpy as np
 
 from .anatomy import anatomy
 from .base import JointParameters, Robot
-from .body_plan import body_plan, default_pose, lowest_point
+from .body_plan import body_plan, default_pose, lowest_point, sole_geoms
 from .loading import RobotError
 
 if TYPE_CHECKING:
@@ -67,10 +67,10 @@ class Ankles:
 def folded(robot: Robot) -> str:
     """Check that the hips stay over half of the legs' length above the ground; raise ``RobotError`` with legs that are folded or weak."""
     model, data = default_pose(robot)
-    build, lying = anatomy(robot), []
+    build, soles, lying = anatomy(robot), sole_geoms(model, robot), []
     for leg in build.legs:
-        foot, hip = model.geom(robot.foot_geoms[leg.foot]).id, model.joint(robot.joint_names[leg.joints[0]]).id
-        height = float(data.xanchor[hip, 2]) - lowest_point(model, data, foot)
+        hip = model.joint(robot.joint_names[leg.joints[0]]).id
+        height = float(data.xanchor[hip, 2]) - min(lowest_point(model, data, geom) for geom in soles[leg.foot])
         if height < FOLDED * build.leg_length:
             lying.append(f"{leg.name} ({height:.3f} m from hip to ground)")
     if lying:

@@ -50,7 +50,9 @@ def test_other_numbers_of_legs_have_no_plan(legs, words):
 
 
 def test_wheels_make_a_plan():
-    assert plan_of(4, ["hip_roll", "hip_pitch", "knee", "wheel"], "it") == "wheeled"
+    build = anatomy(load_robot("go2w"))
+    assert build.plan == "wheeled"
+    assert all(build.roles[leg.joints[-1]] == "wheel" and build.roles[leg.joints[-2]] == "knee" for leg in build.legs)
 
 
 def test_joints_that_are_not_driven_are_held():
