@@ -44,9 +44,9 @@ def _robots(incomplete: str) -> list[str]:
 
 
 def _tasks(incomplete: str) -> list[str]:
-    from ..training.tasks import TASKS
+    from ..training.tasks import GROUNDS, TASKS
 
-    return list(TASKS)
+    return [*GROUNDS, *TASKS]
 
 
 def _policies(incomplete: str) -> list[str]:

@@ -23,7 +23,7 @@ from ..configuration import ConfigurationError, RunConfiguration, TrainingConfig
 from ..environment.configuration import EnvironmentConfiguration
 from ..environment.own_terms import foreign_functions, policy_observations
 from ..processes import own_device
-from ..tasks import TASKS, Task, find_task
+from ..tasks import TASKS, Task, find_task, settled_name
 from .checkpoint import CheckpointError, reached, read_checkpoint, run_numbers
 from .logger import check_logger
 from .request import TrainRequest
@@ -73,6 +73,7 @@ def prepare(request: TrainRequest) -> TrainPlan:
         raise ConfigurationError(
             "--resume continues a run and --init-from begins a new one with its networks; give one of them"
         )
+    request = replace(request, task=settled_name(request.task, request.robot))
     if request.resume is not None:
         return resumed_run(request, request.resume)
     if request.init_from is not None:

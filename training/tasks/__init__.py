@@ -10,6 +10,7 @@ from types import MappingProxyType
 from ...files.parsing import one_line, shown
 from ...files.plugins import imported
 from ...robots import load_robot
+from ...robots.anatomy import PLANS, WORDS, Plan, anatomy
 from ...robots.loading import robot_digest
 from ..configuration import AlgorithmConfiguration, NetworkConfiguration, Ramp, RunConfiguration, TrainingConfiguration
 from ..environment.configuration import (
@@ -52,10 +53,17 @@ class Task:
 
         Raises:
             RobotError: it cannot be found, or is wrong.
+            TaskError: it has another body plan.
         """
         own, robot = load_robot(self.environment.robot, check=False), load_robot(source)
         if robot_digest(robot) == robot_digest(own):
             return self
+        theirs, its = _plan(self.environment.robot), _plan(source)
+        if theirs != its:
+            raise TaskError(
+                f"task '{self.name}' is for {WORDS[theirs]}, and robot '{robot.name}' is {WORDS[its]}; name the ground instead: "
+                f"{', '.join(name for name, tasks in GROUNDS.items() if its in tasks) or 'no task is made for it'}"
+            )
         environment, training = scaled(self.environment, self.training, source)
         return replace(self, environment=environment, training=training)
 
@@ -211,6 +219,41 @@ TASKS: Mapping[str, Task] = MappingProxyType(
 )
 """All tasks by name."""
 
+_ROUGH = {"": "go2-moe-cts", **{f"-{name.removeprefix('go2-')}": name for name, *_ in _METHODS}}
+GROUNDS: Mapping[str, Mapping[str, str]] = MappingProxyType(
+    {
+        **{f"rough{method}": {"quadruped": name} for method, name in _ROUGH.items()},
+        **{name: {"quadruped": "go2-flat"} for name in ("walk", "flat")},
+        "sprint": {"quadruped": "go2-sprint"},
+    }
+)
+"""Names of tasks without a robot: all terrains (``rough``, with a method behind a dash), level ground (``walk``, ``flat``), fast. The
+robot's body plan chooses the task."""
+
+
+def settled_name(name: str, robot: str | None = None) -> str:
+    """Return the task of ``TASKS`` for a ground's name and a robot, None for the Go2; other names stay as they are.
+
+    Raises:
+        TaskError: the ground has no task for the robot's body plan.
+        RobotError: the robot cannot be found, or is wrong.
+    """
+    if name not in GROUNDS:
+        return name
+    plan = _plan(robot) if robot is not None else "quadruped"
+    if plan not in GROUNDS[name]:
+        fits = [each for each, tasks in GROUNDS.items() if plan in tasks]
+        raise TaskError(
+            f"task '{name}' is not made for robot '{load_robot(str(robot)).name}', {WORDS[plan]}; "
+            f"{'tasks for it are: ' + ', '.join(fits) if fits else 'no task is'}"
+        )
+    return GROUNDS[name][plan]
+
+
+def _plan(robot: str) -> Plan:
+    """Return the body plan that a robot's tasks go by: arms make no other task, nor do wheels."""
+    return PLANS[len(anatomy(load_robot(robot)).legs)]
+
 
 def _own_task(path: str) -> Task:
     """Return the task at ``module:attribute``, under this name, by which a resumed run finds it again."""
@@ -226,7 +269,7 @@ def find_task(name: str, overrides: Iterable[str] = (), *, robot: str | None = N
     Schedules are spread over the run's iterations, unless an override sets ``environment.schedule.horizon_steps``.
 
     Args:
-        name: one of ``TASKS``, or ``module:attribute`` of a ``Task`` of one's own.
+        name: one of ``TASKS`` or ``GROUNDS``, or ``module:attribute`` of a ``Task`` of one's own.
         overrides: ``environment.…=value`` and ``training.…=value``, which change what is scaled for the robot.
         robot: name or path of a robot; None for the task's own.
 
@@ -234,16 +277,19 @@ def find_task(name: str, overrides: Iterable[str] = (), *, robot: str | None = N
         TaskError: unknown task, or a key or value that does not fit.
         RobotError: the robot cannot be found, or is wrong.
     """
-    if ":" not in name and name not in TASKS:
-        near = get_close_matches(name, TASKS, n=3, cutoff=0.3)
+    if ":" not in name and name not in TASKS and name not in GROUNDS:
+        names = (*TASKS, *GROUNDS)
+        near = get_close_matches(name, names, n=3, cutoff=0.3)
         hint = f"did you mean {' or '.join(near)}? " if near else ""
-        raise TaskError(f"unknown task '{one_line(name, 80)}'; {hint}the tasks are: {', '.join(TASKS)}")
-    known, chosen = TASKS[name] if name in TASKS else _own_task(name), list(overrides)
+        raise TaskError(f"unknown task '{one_line(name, 80)}'; {hint}the tasks are: {', '.join(names)}")
+    chosen = list(overrides)
     named = [o for o in chosen if o.split("=", 1)[0].strip() == "environment.robot"]
     if named and robot is not None:
         raise TaskError(f"the robot is given twice, as '{robot}' and with environment.robot=; leave one out")
     if named:  # the same as --robot
         robot, chosen = named[-1].split("=", 1)[1].strip(), [o for o in chosen if o not in named]
+    name = settled_name(name, robot)
+    known = TASKS[name] if name in TASKS else _own_task(name)
     if robot is not None:
         known = known.for_robot(robot)
     task = known.with_overrides(chosen)
@@ -251,4 +297,4 @@ def find_task(name: str, overrides: Iterable[str] = (), *, robot: str | None = N
     return task if own_horizon else task.with_horizon()
 
 
-__all__ = ["TASKS", "Task", "TaskError", "find_task"]
+__all__ = ["GROUNDS", "TASKS", "Task", "TaskError", "find_task", "settled_name"]

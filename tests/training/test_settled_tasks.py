@@ -1,0 +1,58 @@
+"""Settings of tasks that runs and cards refer to, and the names that lead to them."""
+
+import hashlib
+import json
+
+import pytest
+from gaitgauge.training.configuration import to_plain
+from gaitgauge.training.tasks import find_task
+
+ADDED: dict[str, object] = {}
+"""Settings that came later, with the values at which nothing changes."""
+SETTLED = {
+    ("go2-moe-cts", None): "d5382feb9a943360",
+    ("go2-cts", None): "bb04a25d8a0c3ee9",
+    ("go2-moe-ng", None): "84c2305e772926fd",
+    ("go2-ac-moe", None): "6ece78d8f99511e2",
+    ("go2-mcp", None): "844d9bc374c490c1",
+    ("go2-him", None): "525133ee0f45de02",
+    ("go2-dreamwaq", None): "abd92fbd893cf9a5",
+    ("go2-flat", None): "d356907218e9c01b",
+    ("go2-sprint", None): "bc6388bf5839b6d8",
+    ("go2-moe-cts", "go1"): "e891785664c2039f",
+    ("go2-flat", "anymal_c"): "af1f21184076f353",
+}
+"""Digests of 27 November 2026."""
+
+
+def flat(value, path=""):
+    if isinstance(value, dict):
+        return {key: each for name, part in value.items() for key, each in flat(part, f"{path}.{name}").items()}
+    return {path[1:]: value}
+
+
+def digest(task):
+    settings = flat({"environment": to_plain(task.environment), "training": to_plain(task.training)})
+    later = {key: settings.pop(key) for key in ADDED if key in settings}
+    assert later == {key: ADDED[key] for key in later}
+    return hashlib.sha256(json.dumps([task.name, task.title, settings], sort_keys=True).encode()).hexdigest()[:16]
+
+
+@pytest.mark.parametrize(("name", "robot"), SETTLED)
+def test_settled_tasks_keep_their_settings(name, robot):
+    assert digest(find_task(name, robot=robot)) == SETTLED[name, robot]
+
+
+@pytest.mark.parametrize(
+    ("ground", "robot", "task"),
+    [
+        ("rough", None, "go2-moe-cts"),
+        ("rough-dreamwaq", "go1", "go2-dreamwaq"),
+        ("flat", "anymal_c", "go2-flat"),
+        ("walk", "go2", "go2-flat"),
+    ],
+)
+def test_a_ground_and_a_robot_are_a_task(ground, robot, task):
+    assert find_task(ground, robot=robot) == find_task(task, robot=robot)
+    if robot is not None:
+        assert find_task(ground, [f"environment.robot={robot}"]) == find_task(task, robot=robot)
