@@ -343,19 +343,22 @@ def check_robot(contract: PolicyContract, robot: Robot) -> tuple[int, ...]:
         For each joint of the policy, its index in the robot's joint order.
 
     Raises:
-        ContractError: another robot, or joint names that are not those of the robot in some order.
+        ContractError: another robot, or joint names that are not, in some order, those of the robot or of one of its variants.
     """
     if contract.robot != robot.name:
         raise ContractError(
             f"the policy is for robot '{contract.robot}', not for '{robot.name}'; leave --robot out, or give a "
             f"policy for '{robot.name}'"
         )
-    if sorted(contract.joint_names) != sorted(robot.joint_names):
+    if robot.driving(contract.joint_names) is None:
+        names = {name: len(each.driven_joints) for name, each in (robot.variants or {}).items()}
+        variants = "".join(f", or the {count} of its variant '{name}'" for name, count in names.items())
         raise ContractError(
             f"the policy's joints are not those of robot '{robot.name}': "
-            f"the policy has {', '.join(contract.joint_names)}; the robot has {', '.join(robot.joint_names)}"
+            f"the policy has {', '.join(contract.joint_names)}; the robot has {', '.join(robot.joint_names)}{variants}"
         )
-    if set(contract.velocity_joints) != (wheels := set(robot.velocity_joints or ())):
+    wheels = set(robot.velocity_joints or ()) & set(contract.joint_names)
+    if set(contract.velocity_joints) != wheels:
         ours, theirs = (", ".join(sorted(names)) or "no joint" for names in (contract.velocity_joints, wheels))
         raise ContractError(
             f"the policy gives targets of velocity to {ours}, robot '{robot.name}' takes them for {theirs}; mend velocity_joints of "
@@ -424,25 +427,31 @@ def standard_contract(
     of wheels stay out of the observation.
 
     Args:
-        robot: gives the joints, the standing pose, the gains and the command limits.
+        robot: gives the joints that a policy drives, the standing pose, the gains and the command limits.
         history: frames in the network's input, None for the current one alone.
     """
     motors = robot.parameters[robot.default_parameters]
+    names = robot.driven_joints or robot.joint_names
+    index = [robot.joint_names.index(name) for name in names]
+
+    def driven(values: Sequence[Any]) -> tuple[Any, ...]:
+        return tuple(values[i] for i in index)
+
     scales = {name: OBSERVATIONS[name].scale for name in STANDARD}
     if robot.velocity_joints:
-        scales["joint_position"] = without_wheels(scales["joint_position"], robot.driven_by_velocity)
+        scales["joint_position"] = without_wheels(scales["joint_position"], driven(robot.driven_by_velocity))
     return PolicyContract(
         robot=robot.name,
-        joint_names=robot.joint_names,
-        default_joint_position=robot.default_joint_position,
-        action_scale=robot.action_scale or (0.25,) * robot.num_joints,
-        stiffness=motors.stiffness,
-        damping=motors.damping,
+        joint_names=names,
+        default_joint_position=driven(robot.default_joint_position),
+        action_scale=driven(robot.action_scale or (0.25,) * robot.num_joints),
+        stiffness=driven(motors.stiffness),
+        damping=driven(motors.damping),
         control_period=0.02,
         observation=tuple(ObservationTerm(name=name, scale=scale) for name, scale in scales.items()),
         history=history or History(),
         command_limits=robot.command_limits,
-        velocity_joints=robot.velocity_joints or (),
+        velocity_joints=tuple(name for name in names if name in (robot.velocity_joints or ())),
         provenance=provenance or {},
     )
 

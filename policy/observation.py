@@ -39,11 +39,17 @@ class ObservationBuilder:
         # a noise stream also draws for what this policy does not observe
         self._noisy = {each.name for each in OBSERVATIONS.values() if each.noise is not None}
         widths = contract.term_widths
-        identity = tuple(range(contract.num_joints))
         # An identity map is left out: indexing costs a kernel per term and step.
-        self._robot_joint = None if index == identity else self._tensor(index, torch.int64)
-        inverse = tuple(index.index(j) for j in identity)
-        self._policy_joint = None if index == identity else self._tensor(inverse, torch.int64)
+        every = tuple(range(robot.num_joints))
+        self._robot_joint = None if index == every else self._tensor(index, torch.int64)
+        # where each of the robot's joints finds its target: among those of the policy, or behind them among those held
+        held = [j for j in every if j not in index]
+        found = [index.index(j) if j in index else len(index) + held.index(j) for j in every]
+        self._policy_joint = None if index == every else self._tensor(found, torch.int64)
+        variant = robot.driving(contract.joint_names)
+        assert variant is not None  # check_robot has found it
+        pose = self._tensor([variant.default_joint_position[j] for j in held])
+        self._held = pose.expand(num_episodes, -1) if held else None
         self._default = self._tensor(contract.default_joint_position)
         self._offset = self._tensor(contract.action_offset or contract.default_joint_position)
         self._action_scale = self._tensor(contract.action_scale)
@@ -174,12 +180,17 @@ class ObservationBuilder:
         return self._in_order(frames.flatten(1))
 
     def targets(self, action: torch.Tensor) -> torch.Tensor:
-        """Return joint targets [rad, rad/s], in the robot's order, of raw actions in the policy's order, both (N, J). NaN stays NaN."""
+        """Return all joints' targets [rad, rad/s] in the robot's order, (N, J), of raw actions in the policy's order; NaN stays NaN.
+
+        Joints that the policy does not drive are held at the pose of the robot's variant.
+        """
         if self.contract.action_clip is not None:
             action = torch.clamp(action, -self.contract.action_clip, self.contract.action_clip)
         target = self._offset + self._action_scale * action
         if self._target_range is not None:
             target = torch.clamp(target, self._target_range[0], self._target_range[1])
+        if self._held is not None:
+            target = torch.cat((target, self._held[: len(target)].to(target.dtype)), dim=1)
         return target if self._policy_joint is None else target[:, self._policy_joint]
 
 

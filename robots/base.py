@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
@@ -85,6 +85,16 @@ class JointParameters:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Variant:
+    """A set of joints that policies drive, for example legs alone; the robot's other joints are held."""
+
+    driven_joints: _Names
+    """In the order that policies use."""
+    default_joint_position: tuple[Angle, ...] | None = None
+    """Pose of all joints of the robot [rad], the held ones' included; None for the robot's own."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class HeldJoint:
     """A joint that no policy drives: its motor holds it at an angle."""
 
@@ -136,10 +146,11 @@ class Robot:
     The mean of the geoms' centres is the foot's position."""
     velocity_joints: _Names | None = None
     """Joints with targets of velocity [rad/s] instead of angle, as wheels have; None for none."""
-
     driven_joints: _Names | None = None
     """Joints that a policy drives, in the order that policies use; the others are held at ``default_joint_position`` with the
     gains of the parameter set. None for all of ``joint_names``."""
+    variants: Mapping[Name, Variant] | None = None
+    """Other sets of driven joints, by name; a policy for the joints of one makes the robot this variant."""
 
     @property
     def num_joints(self) -> int:
@@ -171,3 +182,14 @@ class Robot:
             for name, angle, kp, kd in rows
             if name not in driven
         )
+
+    def driving(self, joints: Collection[str]) -> Robot | None:
+        """Return the robot as the variant of which a policy drives these joints, in any order; None where there is none."""
+        if set(joints) == set(self.driven_joints or self.joint_names):
+            return self
+        every = Variant(driven_joints=self.joint_names)
+        for each in (*(self.variants or {}).values(), every):
+            if set(joints) == set(each.driven_joints):
+                pose = each.default_joint_position or self.default_joint_position
+                return replace(self, driven_joints=each.driven_joints, default_joint_position=pose)
+        return None

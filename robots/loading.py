@@ -36,7 +36,7 @@ _JOINT_ENDING = "_joint"
 PER_JOINT = tuple(f.name for f in fields(JointParameters) if f.name not in ("delay", "motor", "network", "measured"))
 """Fields of a parameter set with a value for each joint."""
 _MEASURED = ("stiffness_factor", "damping_factor", "target_offset", "delay", "network", "measured")
-_ADDED_LATER = ("foot_shapes", "action_scale", "imu_site", "driven_joints", "velocity_joints")
+_ADDED_LATER = ("foot_shapes", "action_scale", "imu_site", "driven_joints", "variants", "velocity_joints")
 """Fields that count for a robot's digest only where set, so that digests of older descriptions stay."""
 
 
@@ -70,6 +70,7 @@ def load_robot_file(path: str | Path) -> Robot:
                 _begin_like(table, sets, f"{source}: parameters.{name}")
                 _place_network(table, file.parent)
                 _spread(table, PER_JOINT, names, f"{source}: parameters.{name}")
+        _read_variants(data, names, source)
     elif isinstance(names, list):
         raise RobotError(f"{source}: joint_names must hold names, each once")
     if isinstance(data.get("mjcf"), str):
@@ -77,6 +78,24 @@ def load_robot_file(path: str | Path) -> Robot:
     robot = build(Robot, data, source, RobotError)
     _check(robot, source)
     return robot
+
+
+def _read_variants(data: dict[str, Any], joints: list[str], source: str) -> None:
+    """Expand words of joint names in ``driven_joints``, and the pose of each variant, which begins with the robot's own."""
+    pose, variants = data.get("default_joint_position"), data.get("variants")
+    named = {f"variants.{name}": table for name, table in variants.items()} if isinstance(variants, dict) else {}
+    for where, table in {"": data, **named}.items():
+        if not isinstance(table, dict):
+            continue
+        place = f"{source}: {where}{'.' if where else ''}"
+        if isinstance(driven := table.get("driven_joints"), list):
+            for word in driven:
+                if not any(isinstance(word, str) and _fits(word, joint) for joint in joints):
+                    raise RobotError(f"{place}driven_joints has {shown(word)}, neither a joint nor words of its name")
+            table["driven_joints"] = [joint for joint in joints if any(_fits(word, joint) for word in driven)]
+        if where and isinstance(held := table.get("default_joint_position"), dict) and isinstance(pose, list):
+            own = dict(zip(joints, pose, strict=False))
+            table["default_joint_position"] = _by_key(held, joints, f"{place}default_joint_position", own)
 
 
 def _begin_like(table: dict[str, Any], sets: dict[str, Any], where: str) -> None:
@@ -270,7 +289,10 @@ def _spread(table: dict[str, Any], keys: Any, joints: list[str], where: str) -> 
             table[key] = [value] * len(joints)
 
 
-def _by_key(table: Mapping[str, Any], joints: list[str], where: str) -> list[Any]:
+def _by_key(
+    table: Mapping[str, Any], joints: list[str], where: str, otherwise: Mapping[str, Any] | None = None
+) -> list[Any]:
+    """Return the value of each joint in a table by words of names; a joint without one gets the value ``otherwise``."""
     for key in table:
         if not any(_fits(key, joint) for joint in joints):
             hint = did_you_mean(key, [j.removesuffix(_JOINT_ENDING) for j in joints])
@@ -279,6 +301,9 @@ def _by_key(table: Mapping[str, Any], joints: list[str], where: str) -> list[Any
     values = []
     for joint in joints:
         fitting = [key for key in table if _fits(key, joint)]
+        if not fitting and otherwise is not None:
+            values.append(otherwise[joint])
+            continue
         if not fitting:
             raise RobotError(f"{where} has no value for the joint {shown(joint)}; add its name or words of it")
         values.append(table[max(fitting, key=len)])
@@ -309,6 +334,9 @@ def _check(robot: Robot, source: str) -> None:
     per_joint: dict[str, tuple[float, ...]] = {"default_joint_position": robot.default_joint_position}
     if robot.action_scale is not None:
         per_joint["action_scale"] = robot.action_scale
+    for name, each in (robot.variants or {}).items():
+        if each.default_joint_position is not None:
+            per_joint[f"variants.{name}.default_joint_position"] = each.default_joint_position
     for name, constants in robot.parameters.items():
         per_joint |= {f"parameters.{name}.{k}": v for k in PER_JOINT if (v := getattr(constants, k)) is not None}
     for key, values in per_joint.items():
@@ -327,10 +355,11 @@ def _check(robot: Robot, source: str) -> None:
         odd = next((n for n in robot.sdk_joint_names if n not in robot.joint_names), None)
         problem = f"names {shown(odd)}, which is none of joint_names" if odd else "does not name each joint once"
         raise RobotError(f"{source}: sdk_joint_names {problem}; give every joint once, in the SDK's order of motors")
-    for name in robot.driven_joints or ():
-        if name not in robot.joint_names:
-            hint = did_you_mean(name, robot.joint_names)
-            raise RobotError(f"{source}: driven_joints names {shown(name)}, which is none of joint_names{hint}")
+    sets = {f"variants.{name}.driven_joints": each.driven_joints for name, each in (robot.variants or {}).items()}
+    for key, names in {"driven_joints": robot.driven_joints or (), **sets}.items():
+        for name in names:
+            if name not in robot.joint_names:
+                raise RobotError(f"{source}: {key} names {shown(name)}, which is none of joint_names")
     if robot.default_parameters not in robot.parameters:
         known = ", ".join(robot.parameters)
         raise RobotError(f"{source}: default_parameters is {shown(robot.default_parameters)}; choose from: {known}")

@@ -58,7 +58,7 @@ class Walk:
         if noise is not None:
             self._noise = NoiseReader(make_stream(noise, robot.num_joints, count, device), count, device)
             self._noise.begin(range(count), episodes, [0] * count, steps)
-        self._action = torch.zeros(count, robot.num_joints, device=device)
+        self._action = torch.zeros(count, policy.contract.num_joints, device=device)
         self._latency: torch.Tensor | None = None
         if any(late is not None for late in latency):
             self._latency = torch.tensor([-1 if late is None else late for late in latency], device=device)

@@ -99,7 +99,7 @@ class ControlStep(ABC):
         self.stream = make_stream(suite.noise, scene.robot.num_joints, count, device)
         weight = GRAVITY * total_mass(scene.robot)
         self.samples = SampleTable(suite, scene.robot, weight, backend.state, one_by_one=one_by_one)
-        self.buffers = WorldBuffers.allocate(count, scene.robot.num_joints, device, dtype)
+        self.buffers = WorldBuffers.allocate(count, policy.contract.num_joints, device, dtype)
         commands = suite.commands
         fastest = max(commands.target_speed.values(), default=0.0)
         # velocity goals keep to the limits, and so does the way to the target unless the suite is an odd one

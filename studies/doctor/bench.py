@@ -134,7 +134,7 @@ def _play(policy: Policy, tried: Sequence[Alternative | Outcome], physics: Physi
     _to_start(physics, [*tried, *[tried[-1]] * (spare // each)], each)
     limits = torch.tensor(policy.contract.command_limits, device=device, dtype=dtype)
     walking = (torch.tensor(_SHARES, device=device, dtype=dtype) * limits).repeat(count // each, 1)
-    action = torch.zeros(count, robot.num_joints, device=device)
+    action = torch.zeros(count, policy.contract.num_joints, device=device)
     alive = torch.arange(count, device=device) < used
     still = torch.zeros(spare, policy.contract.observation_width, device=device)
     joints = torch.zeros(spare, robot.num_joints, device=device)
@@ -188,9 +188,13 @@ def _to_start(physics: PhysicsBackend, tried: Sequence[Alternative | Outcome], e
     robot, device, dtype = physics.scene.robot, physics.device, physics.dtype
     gains: list[list[list[float]]] = [[], []]
     for one in tried:
-        index = [one.contract.joint_names.index(name) for name in robot.joint_names]
-        for values, column in ((one.contract.stiffness, gains[0]), (one.contract.damping, gains[1])):
-            column += [[values[i] for i in index]] * each
+        own, names = robot.parameters[robot.default_parameters], one.contract.joint_names
+        for sent, held, column in (
+            (one.contract.stiffness, own.stiffness, gains[0]),
+            (one.contract.damping, own.damping, gains[1]),
+        ):
+            values = dict(zip(robot.joint_names, held, strict=True)) | dict(zip(names, sent, strict=True))
+            column += [list(values.values())] * each
     kp, kd = (torch.tensor(column, device=device, dtype=dtype) for column in gains)
     physics.randomize(Randomization(stiffness_scale=kp, damping_scale=kd))
     physics.reset(physics.standing())
