@@ -202,12 +202,9 @@ def check_mujoco() -> Iterator[Finding]:
         yield Finding(what, PROBLEM, f"package {package} loads library {library}", advice)
 
 
-_PACKAGES_OF = {"egl": "libegl1 (and a GPU driver or libgl1-mesa-dri)", "osmesa": "libosmesa6"}
-
-
 def check_rendering() -> Iterator[Finding]:
     """Check MuJoCo's ways to render without a window; one is enough for videos."""
-    works = {backend: not ask(picture.PROBE, MUJOCO_GL=backend)[1] for backend in picture.RENDERERS}
+    works = {backend: not ask(picture.PROBE, MUJOCO_GL=backend)[1] for backend in picture.renderers()}
     for backend, good in works.items():
         what = f"rendering ({backend})"
         if good:
@@ -215,14 +212,18 @@ def check_rendering() -> Iterator[Finding]:
         elif any(works.values()):
             yield Finding(what, OK, "does not work, but the other way does")
         else:
-            advice = f"for videos, install {_PACKAGES_OF[backend]}, with apt on Debian and Ubuntu"
+            advice = f"for videos, {picture.REMEDIES[backend]}"
+            advice += ", with apt on Debian and Ubuntu" if sys.platform == "linux" else ""
             yield Finding(what, WARNING, "does not work", advice)
 
 
 def check_display() -> Iterator[Finding]:
     """Check that a window can be opened."""
     own = "the system's own" if sys.platform in ("darwin", "win32") else None
-    if display := own or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
+    if not picture.window_possible():
+        advice = f"{picture.WITH_MJPYTHON}, or watch in a browser with --viewer viser"
+        yield Finding("display", WARNING, f"{own}; on macOS the viewer's window needs mjpython", advice)
+    elif display := own or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
         yield Finding("display", OK, display)
     else:
         advice = "only the viewer's window needs one; over ssh use ssh -X, or --viewer viser for a browser"

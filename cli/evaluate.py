@@ -14,7 +14,8 @@ from rich.text import Text
 
 from ..gauge.coverage import notes, score_label, suite_label
 from ..gauge.evaluate import Status, evaluate, identity, prepare
-from ..gauge.report.page import write_report
+from ..gauge.report.page import FELL_AT_LIMIT, falls_at_limit, write_report
+from ..gauge.report.references import comparable, references_for
 from ..gauge.request import Request
 from ..gauge.result import Result
 from ..gauge.results import ALL
@@ -113,6 +114,7 @@ def print_results(console: Terminal, result: Result) -> None:
             table.add_row(name, *values, _interval(metric.interval))
         console.print(table)
         console.say("  ".join(f"{k} {v:.4f}" for k, v in result.groups.items()))
+    print_score(console, result)
     for note in notes(result):
         console.say(note)
     health = result.health
@@ -124,6 +126,12 @@ def print_results(console: Terminal, result: Result) -> None:
     if troubles:
         episodes = "quality episode" if health.episodes == 1 else "quality episodes"
         console.say(f"in {health.episodes} {episodes}: {', '.join(troubles)}")
+    if falls_at_limit(result.environments, health):
+        console.say(FELL_AT_LIMIT)
+
+
+def print_score(console: Terminal, result: Result) -> None:
+    """Print the score, or the level, with its interval, scores of known policies, and which scores compare with it."""
     if result.score is not None:
         interval = result.score_interval
         note = f"95 % interval {_interval(interval)}" if interval else str(result.chance.note)
@@ -133,6 +141,13 @@ def print_results(console: Terminal, result: Result) -> None:
         note = f"  (95 % interval {_interval(interval, 2)})" if interval else ""
         note += "" if result.complete else f"  {result.coverage.words}"
         console.say(Text.assemble((f"mean level {result.level:.2f}", "bold"), note))
+    if result.score is None:
+        return
+    best = {r.kind: r for r in reversed(references_for(result))}  # the references come with the best first
+    if best:
+        beside = sorted(best.values(), key=lambda r: -r.score)
+        console.say("for comparison: " + "; ".join(f"{r.policy}: {r.score:.4f}" for r in beside))
+    console.say(comparable(result))
 
 
 def _interval(found: Sequence[float] | None, digits: int = 4) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -14,9 +15,16 @@ from .probe import ask
 if TYPE_CHECKING:
     import mujoco
 
-RENDERERS = ("egl", "osmesa")
-"""Ways to draw without a display, the faster first; the value of MUJOCO_GL."""
-_ON_THE_CPU = ("llvmpipe", "softpipe", "swrast", "swiftshader")
+REMEDIES = {
+    "egl": "install libegl1 and libgl1-mesa-dri",
+    "osmesa": "install libosmesa6",
+    "cgl": "log in at the screen of this Mac, not over ssh alone",
+    "wgl": "install the graphics driver of the GPU's maker",
+}
+"""Advice by the way to draw without a window, which is the value of MUJOCO_GL."""
+WITH_MJPYTHON = "start it as: mjpython -m gaitgauge.cli.main play POLICY"
+"""Advice for the viewer's window on macOS."""
+_ON_THE_CPU = ("llvmpipe", "softpipe", "swrast", "swiftshader", "apple software renderer", "gdi generic")
 """Names of drivers that draw without a GPU."""
 PROBE = """
 import json, mujoco
@@ -74,22 +82,39 @@ PLAIN = Quality(
 """For a CPU that draws: an eighth of the time of ``RICH`` (``benchmarks/video_speed.py``)."""
 
 
+def window_possible() -> bool:
+    """Return False on macOS in a Python that ``mjpython`` did not start: MuJoCo's viewer needs it there."""
+    return sys.platform != "darwin" or "MJPYTHON_BIN" in os.environ
+
+
+def renderers() -> tuple[str, ...]:
+    """Return the ways to draw without a window that MuJoCo has on this platform, the faster first."""
+    return {"darwin": ("cgl",), "win32": ("wgl",)}.get(sys.platform, ("egl", "osmesa"))
+
+
 def choose_renderer() -> Quality:
     """Return the quality that this machine can draw, and set ``MUJOCO_GL`` to the way; call it before MuJoCo is imported.
 
     Raises:
         UserError: nothing draws.
     """
-    asked = os.environ.get("MUJOCO_GL")
-    for name in (asked,) if asked else RENDERERS:
+    asked, ways = os.environ.get("MUJOCO_GL"), renderers()
+    for name in (asked,) if asked else ways:
         driver, trouble = ask(PROBE, MUJOCO_GL=name)
         if not trouble:
             os.environ["MUJOCO_GL"] = name
             return PLAIN if name == "osmesa" or any(n in driver.lower() for n in _ON_THE_CPU) else RICH
-    named = f"MUJOCO_GL={asked} does not draw" if asked else "neither EGL nor OSMesa draws"
+    named = {"egl": "EGL", "osmesa": "OSMesa", "cgl": "CGL", "wgl": "WGL"}
+    failed = (
+        f"neither {' nor '.join(named[w] for w in ways)} draws" if len(ways) > 1 else f"{named[ways[0]]} does not draw"
+    )
+    remedies = [REMEDIES[w] for w in ways]
+    if asked:
+        failed = f"MUJOCO_GL={asked} does not draw"
+        remedies = [REMEDIES[asked] if asked in ways else f"set MUJOCO_GL to {' or '.join(ways)}, or unset it"]
     raise UserError(
-        f"videos need off-screen rendering, and {named} on this machine; install libegl1 and libgl1-mesa-dri, or "
-        "libosmesa6, or watch in a browser with --viewer viser"
+        f"videos need off-screen rendering, and {failed} on this machine; {', or '.join(remedies)}, or watch in a browser "
+        "with --viewer viser"
     )
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from .console import Terminal
 from .errors import UserError
-from .picture import choose_renderer
+from .picture import WITH_MJPYTHON, choose_renderer, window_possible
 from .progress import ProgressDisplay
 from .requests import VIEWERS, PlayRequest
 from .video import CLIP_ENDINGS, VIDEO_ENDINGS, check_film_path
@@ -39,14 +39,16 @@ def run_play(asked: PlayRequest) -> None:
     """
     viewer = _check(asked)
     quality = choose_renderer() if viewer == "video" else None  # before MuJoCo is imported
+    from ..policy.finding import shipped_policies
     from .play_session import beyond
     from .worlds import WorldMaker
 
     console, maker = Terminal(), WorldMaker(asked)
     level = maker.default_level(asked.terrain) if asked.level is None else asked.level
     sessions = maker.make_all(asked.policies, asked.terrain, level, asked.friction)
-    for session in sessions:
-        console.say(f"{session.policy.path} on {session.readout().place}, {asked.backend}, friction {asked.friction:g}")
+    for named, session in zip(asked.policies, sessions, strict=True):
+        shown = named if named in shipped_policies() else session.policy.path
+        console.say(f"{shown} on {session.readout().place}, {asked.backend}, friction {asked.friction:g}")
         if asked.command and (sentence := beyond(asked.command, session.limits)):
             console.say(f"{session.label}: {sentence}" if len(sessions) > 1 else sentence)
     if viewer == "viser":
@@ -116,7 +118,9 @@ def _viewer(asked: str | None, films: Sequence[str], *, several: bool) -> str:
         return "video"
     if asked == "native" and several:
         raise UserError("the window shows one policy; for several use --viewer viser for a browser, or --out FILE.mp4")
+    if asked == "native" and not window_possible():
+        raise UserError(f"on macOS the window needs mjpython; {WITH_MJPYTHON}, or use --viewer viser for a browser")
     display = sys.platform in ("darwin", "win32") or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
     if asked == "native" and not display:
         raise UserError("there is no display for a window; use --viewer viser for a browser, or --out FILE.mp4")
-    return asked or ("native" if display and not several else "viser")
+    return asked or ("native" if display and window_possible() and not several else "viser")

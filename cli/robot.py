@@ -106,22 +106,15 @@ def _refuse_existing(path: Path, force: bool) -> None:
         raise UserError(f"'{path}' already exists; give another folder (--out), or replace it with --force")
 
 
-def check_robot_files(asked: str, *, picture: Path | None, draw: bool, json_output: bool) -> bool:
-    """Print every check, and draw the standing pose; return False where a check failed that everything needs.
+def check_robot_files(asked: str, *, picture: Path | None, json_output: bool) -> bool:
+    """Print every check, and draw the standing pose if asked; return False where a check failed that everything needs.
 
     Raises:
-        UserError: the picture's name does not end in .png, or it is asked for and cannot be drawn.
+        UserError: the picture's name does not end in .png, or it cannot be drawn.
     """
     if picture is not None and picture.suffix.lower() != ".png":
         raise UserError(f"--picture is '{picture}'; give a file that ends in .png")
-    quality, silent = None, ""
-    if draw:
-        try:
-            quality = choose_renderer()  # before MuJoCo is imported
-        except UserError as error:
-            if picture is not None:
-                raise
-            silent = f"no picture: {error}"
+    quality = None if picture is None else choose_renderer()  # before MuJoCo is imported
     robot: Robot | None = None
     try:
         robot = load_robot(Path(asked) if os.path.isdir(asked) else asked, check=False)
@@ -132,9 +125,9 @@ def check_robot_files(asked: str, *, picture: Path | None, draw: bool, json_outp
         findings = [Finding(check="description", passed=False, sentence=str(error), needed_for=_EVERYTHING)]
     sound = all(f.passed for f in findings if f.needed_for == _EVERYTHING)
     drawn = None
-    if sound and robot is not None and quality is not None:
-        drawn = picture or Path(f"{robot.name}-standing.png")
-        _draw(robot, quality, drawn)
+    if sound and robot is not None and quality is not None and picture is not None:
+        drawn = picture
+        _draw(robot, quality, picture)
     if json_output:
         rows = [asdict(f) for f in findings]
         print_json({"robot": asked, "sound": sound, "checks": rows, "picture": drawn and str(drawn)})
@@ -145,8 +138,8 @@ def check_robot_files(asked: str, *, picture: Path | None, draw: bool, json_outp
         word, style = ("pass", "green") if finding.passed else ("FAIL", "bold red") if needed else ("note", "yellow")
         more = "" if finding.passed or needed else f" ({finding.needed_for} needs it)"
         console.say(Text.assemble((word, style), f"  {finding.check}: {finding.sentence}{more}"))
-    if drawn is not None or silent:
-        console.say(f"picture {drawn}" if drawn else silent)
+    if drawn is not None:
+        console.say(f"picture {drawn}")
     console.say("the robot is sound" if sound else "the robot cannot be used yet")
     return sound
 

@@ -139,7 +139,7 @@ def terminals() -> None:
     text = "\n".join(line for line in run("doctor", "doctor").splitlines()[1:] if not private.search(line))
     terminal("terminal-doctor.png", "gaitgauge doctor", text)
     text = run("robot", "robot", "check", "go2", "--picture", "go2-standing.png")
-    terminal("robot-check.png", "gaitgauge robot check go2", text)
+    terminal("robot-check.png", "gaitgauge robot check go2 --picture go2-standing.png", text)
     shown, standing = Image.open(MEDIA / "robot-check.png").convert("RGB"), Image.open(WORK / "go2-standing.png")
     standing = standing.resize((shown.width, shown.width * 9 // 16)).crop((0, 90, shown.width, 610))
     both = Image.new("RGB", (shown.width, shown.height + 520), "white")
@@ -156,7 +156,7 @@ def evaluation() -> None:
     terminal("terminal-evaluate.png", "gaitgauge evaluate pretrained --suite demo --out demo", text)
     whole = WORK / "whole"
     whole.mkdir(exist_ok=True)
-    shutil.copy(CARDS / "pretrained-gaitgauge-1.json", whole / "results.json")
+    shutil.copy(CARDS / "pretrained-robogauge-1.1.json", whole / "results.json")
     shutil.copy(WORK / "demo" / "clip.webp", whole / "clip.webp")
     report = write_report(whole).as_uri()
     shoot(report, "report.png", width=1000)

@@ -87,19 +87,18 @@ def new(
 @command(robot)
 def check(
     robot: Annotated[str, _CHECKED],
-    picture: Annotated[Path | None, Choice("Picture of the standing pose (.png). Default: NAME-standing.png.")] = None,
-    no_picture: Annotated[bool, Choice("Draw nothing.")] = False,
+    picture: Annotated[Path | None, Choice("Write a picture of the standing pose (.png).")] = None,
     json_output: Annotated[bool, Choice("Print JSON instead of sentences.", flags=("--json",))] = False,
 ) -> None:
     """Check a robot's description and model, and let it stand; exit code 1 where something is wrong.
 
     Examples:
       gaitgauge robot check mine/robot.toml
-      gaitgauge robot check go2 --no-picture
+      gaitgauge robot check go2 --picture standing.png
     """
     from ..robot import check_robot_files
 
-    if not check_robot_files(robot, picture=picture, draw=not no_picture, json_output=json_output):
+    if not check_robot_files(robot, picture=picture, json_output=json_output):
         raise typer.Exit(1)
 
 

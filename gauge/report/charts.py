@@ -48,21 +48,29 @@ def number(value: float) -> str:
     return f"{round(value, 3):g}".replace("-", "−")
 
 
-def strip(marks: Mapping[str, float | None], interval: Sequence[float] | None) -> dict[str, Any]:
+def strip(
+    marks: Mapping[str, float | None], interval: Sequence[float] | None, others: Sequence[float] = ()
+) -> dict[str, Any]:
     """Return one line of a score chart: marks for the statistics and a band for the interval.
 
     Args:
         marks: ``mean50`` and, where known, ``mean`` and ``mean25``, all in [0, 1].
+        others: scores in [0, 1] that the line is compared with.
 
     Returns:
-        ``ticks``: x of 0, 0.25 … 1; ``band``: (x, width) or None; ``marks``: x by statistic.
+        ``ticks``: x of 0, 0.25 … 1; ``band``: (x, width) or None; ``marks``: x by statistic; ``others``: their x.
     """
     band = None
     if interval is not None:
         low, high = (_strip_x(v) for v in interval)
         band = (low, round(max(high - low, 1.0), 2))
     places = {statistic: _strip_x(value) for statistic, value in marks.items() if value is not None}
-    return {"ticks": [_strip_x(i / 4) for i in range(5)], "band": band, "marks": places}
+    return {
+        "ticks": [_strip_x(i / 4) for i in range(5)],
+        "band": band,
+        "marks": places,
+        "others": [_strip_x(v) for v in others],
+    }
 
 
 def _strip_x(value: float) -> float:

@@ -20,7 +20,7 @@ from . import charts
 from .breakdown import breakdown
 from .charts import number, terrain_label
 from .pages import page_of, page_template
-from .references import references_for
+from .references import comparable, references_for
 
 STATISTIC_LABELS = {"mean": "mean", "mean50": "mean@50", "mean25": "mean@25"}
 """In the order in which the radar draws them."""
@@ -36,7 +36,12 @@ _LONGEST = 400
 _DIVERGED = "The simulation became invalid there; each counts as a fall. The engine or its settings may be at fault."
 _DROPPED = "The engine had no room for all contacts or constraints there, so these values are not exact."
 _FELL = "The robot tilted beyond the suite's limit; the suite says what that ends and what it costs."
+FELL_AT_LIMIT = "Quality is measured at the highest level that the policy passes, where it is at its limit; the score counts the fall."
+_MANY_FALLS = 0.5
+"""Falls for each quality episode above which falls at the policy's own limit are grave, too."""
 _TOUCHED = "Legs that strike each other can break on a robot; episodes.csv says at which commands."
+_LITTLE_CONTACT = 0.01
+"""Share of the samples below which contact of the robot with itself takes one line."""
 _FAILED = "They score zero and no quality is measured there."
 _SANK = "A foot sank into the terrain, and the goal was started again once, as the suite says."
 
@@ -89,6 +94,7 @@ def report_data(result: Result) -> dict[str, Any]:
     expected = result.chance.level != "bisection"
     counts = [_plural(len(terrains), "terrain"), _plural(len(rows), "environment")]
     counts += [_plural(result.health.episodes, "quality episode")] if result.health.episodes else []
+    references = references_for(result)
     groups = {name: (value, result.groups_interval.get(name)) for name, value in result.groups.items()}
     return {
         "result": result,
@@ -103,7 +109,9 @@ def report_data(result: Result) -> dict[str, Any]:
         "evaluated": evaluated,
         "searched": searched,
         "score_label": score_label(result),
-        "score_strip": None if result.score is None else charts.strip({"mean50": result.score}, result.score_interval),
+        "score_strip": None
+        if result.score is None
+        else charts.strip({"mean50": result.score}, result.score_interval, [r.score for r in references]),
         "groups": {
             name: {"value": value, "interval": interval, "strip": charts.strip({"mean50": value}, interval)}
             for name, (value, interval) in groups.items()
@@ -122,8 +130,11 @@ def report_data(result: Result) -> dict[str, Any]:
         "metric_matrix": metric_matrix(rows),
         "breakdown": breakdown(rows),
         "references": [
-            {"of": r, "strip": charts.strip({"mean50": r.score}, r.interval)} for r in references_for(result)
+            {"of": r, "strip": charts.strip({"mean50": r.score}, r.interval, [result.score])}
+            for r in references
+            if result.score is not None
         ],
+        "comparable": comparable(result) if evaluated else None,
         "searches": charts.searches(rows),
         "rows": [(row, [f"{count} {flag}" for flag in _FLAGS if (count := getattr(row, flag))]) for row in rows],
         "events": any(getattr(r, flag) for r in rows for flag in _FLAGS),
@@ -144,23 +155,26 @@ def warnings(rows: Sequence[EnvironmentRow], health: Health, remarks: Sequence[s
         remarks: sentences for the reader of the score.
 
     Returns:
-        For each kind ``severity`` (``grave`` or ``note``), ``headline``, ``meaning`` and ``places``, the worst first.
+        For each kind ``severity`` (``grave``, ``note`` or ``slight``), ``headline``, ``meaning`` and ``places``, the worst first.
     """
     total = _plural(health.episodes, "quality episode")
     failed, restarted = [r for r in rows if r.level == 0], sum(r.restarted or 0 for r in rows)
     searched = _plural(sum(r.search is not None for r in rows), "searched environment")
     share = health.self_contact or 0.0
     touching = f"parts of the robot touch each other in {_percent(share)} of the samples"
+    touch = "slight" if share < _LITTLE_CONTACT else "note"
+    at_limit = falls_at_limit(rows, health)
+    fall, fell = ("note", FELL_AT_LIMIT) if at_limit else ("grave", _FELL)
     kinds = [
         (health.diverged, "grave", f"physics diverged in {health.diverged} of {total}", _DIVERGED, "diverged"),
         (health.overflowed, "grave", f"contacts dropped in {health.overflowed} of {total}", _DROPPED, "overflowed"),
-        (health.falls, "grave", f"{_plural(health.falls, 'fall')} in {total}", _FELL, "falls"),
-        (share, "note", touching, _TOUCHED, "self_contact"),
+        (health.falls, fall, f"{_plural(health.falls, 'fall')} in {total}", fell, "falls"),
+        (share, touch, touching, _TOUCHED, "self_contact"),
         (failed, "note", f"not even level 1 passed in {len(failed)} of {searched}", _FAILED, None),
         *((text, "note", "for the reader of the score", f"{text[0].upper()}{text[1:]}.", "") for text in remarks),
         (restarted, "note", f"restarts in {restarted} of {total}", _SANK, "restarted"),
     ]
-    return [
+    found = [
         {
             "severity": severity,
             "headline": headline,
@@ -170,6 +184,13 @@ def warnings(rows: Sequence[EnvironmentRow], health: Health, remarks: Sequence[s
         for happened, severity, headline, meaning, key in kinds
         if happened
     ]
+    return sorted(found, key=lambda w: ("grave", "note", "slight").index(w["severity"]))
+
+
+def falls_at_limit(rows: Sequence[EnvironmentRow], health: Health) -> bool:
+    """Return whether all falls of a run happened at levels that were searched for, and not in more than half of its episodes."""
+    elsewhere = any(r.falls and r.search is None for r in rows)
+    return 0 < health.falls <= _MANY_FALLS * health.episodes and not elsewhere
 
 
 def _places(rows: Sequence[EnvironmentRow], key: str | None) -> list[str]:

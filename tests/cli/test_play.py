@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import torch
 from gaitgauge.backends import ResetState
-from gaitgauge.cli import scenery
-from gaitgauge.cli.picture import show
+from gaitgauge.cli import doctor, play, scenery
+from gaitgauge.cli.picture import PLAIN, show
 from gaitgauge.cli.play_session import beyond
 from gaitgauge.gauge.suite import load_suite
 from gaitgauge.policy.native import save_policy
@@ -328,6 +328,25 @@ def test_window_without_a_display(refused, policy, monkeypatch):
     message = refused("play", policy, "--viewer", "native")
     assert "viser" in message
     assert "--out" in message
+
+
+def test_window_on_macos_needs_mjpython(refused, policy, monkeypatch):
+    monkeypatch.setattr(sys, "platform", "darwin")
+    monkeypatch.delenv("MJPYTHON_BIN", raising=False)
+    assert "mjpython -m gaitgauge.cli.main play POLICY" in refused("play", policy, "--viewer", "native")
+    (display,) = doctor.check_display()
+    assert display.status == "warning" and "needs mjpython" in display.found
+    assert play._viewer(None, [], several=False) == "viser"
+    monkeypatch.setenv("MJPYTHON_BIN", "/mjpython")
+    assert play._viewer(None, [], several=False) == "native"
+    assert next(doctor.check_display()).status == "ok"
+
+
+def test_a_policy_that_ships_is_named_without_the_folder_of_the_installation(run, tmp_path, monkeypatch):
+    monkeypatch.setattr("gaitgauge.cli.play.choose_renderer", lambda: PLAIN)
+    monkeypatch.setattr("gaitgauge.cli.recording.record", lambda *a: None)
+    shown = run("play", "pretrained", "--gif", tmp_path / "a.gif").stdout.splitlines()[0]
+    assert shown.startswith("pretrained on ")
 
 
 def test_video_into_a_wrong_file(refused, policy):

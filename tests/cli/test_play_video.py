@@ -57,6 +57,26 @@ def test_machine_without_a_renderer(monkeypatch):
         choose_renderer()
 
 
+@pytest.mark.parametrize(
+    ("platform", "asked", "sentence"),
+    [
+        ("darwin", None, "CGL does not draw on this machine; log in at the screen of this Mac"),
+        ("win32", None, "WGL does not draw on this machine; install the graphics driver"),
+        ("darwin", "egl", "MUJOCO_GL=egl does not draw on this machine; set MUJOCO_GL to cgl, or unset it"),
+    ],
+)
+def test_each_platform_has_its_own_way_to_draw(monkeypatch, platform, asked, sentence):
+    monkeypatch.setattr(sys, "platform", platform)
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
+    tried = []
+    monkeypatch.setattr("gaitgauge.cli.picture.ask", lambda program, MUJOCO_GL: (tried.append(MUJOCO_GL), "no"))  # noqa: N803
+    if asked:
+        monkeypatch.setenv("MUJOCO_GL", asked)
+    with pytest.raises(UserError, match=sentence):
+        choose_renderer()
+    assert tried == [asked or {"darwin": "cgl", "win32": "wgl"}[platform]]
+
+
 def test_driver_decides_what_a_picture_may_cost(monkeypatch):
     for driver, quality in (("llvmpipe (LLVM 15.0.6, 256 bits)", PLAIN), ("NVIDIA H200/PCIe/SSE2", RICH)):
         monkeypatch.setenv("MUJOCO_GL", "egl")

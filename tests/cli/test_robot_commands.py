@@ -15,8 +15,6 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "robots"))
 from stick_robot import write_stick
 from unseen_robot import LEGS, write_unseen
 
-WITHOUT_DISPLAY = "--no-picture"
-
 
 @pytest.fixture
 def model(tmp_path):
@@ -33,8 +31,9 @@ def test_new_and_check(run, model):
     assert robot.mjcf.resolve() == model.resolve()
     assert robot.foot_names == tuple(f"sole of {leg}" for leg in ("fore_left", "fore_right", "hind_left", "hind_right"))
     assert set(robot.collision_bodies) == {"corpus", *(f"{p}.{leg[0]}" for p in ("femur", "tibia") for leg in LEGS)}
-    checked = run("robot", "check", "mine", "--json", WITHOUT_DISPLAY)
-    assert checked.exit_code == 0
+    before = sorted(Path().rglob("*"))
+    checked = run("robot", "check", "mine", "--json")
+    assert checked.exit_code == 0 and sorted(Path().rglob("*")) == before, "a check writes nothing unless asked"
     found = json.loads(checked.stdout)
     assert found["sound"] and found["picture"] is None
     rows = {row["check"]: row for row in found["checks"]}
@@ -49,8 +48,8 @@ def test_a_bare_process_has_loaded_what_its_enclosed_one_calls(tmp_path):
     program = [sys.executable, "-m", "gaitgauge.cli.main", "robot"]
     for words, said in (
         (["new", write_stick(tmp_path), "--out", "mine"], "wrote mine/robot.toml: stick, 4 legs, 12 joints"),
-        (["check", "mine", WITHOUT_DISPLAY], "the robot is sound"),
-        (["check", "go2", WITHOUT_DISPLAY], "the robot is sound"),
+        (["check", "mine"], "the robot is sound"),
+        (["check", "go2"], "the robot is sound"),
     ):
         done = subprocess.run([*program, *words], cwd=tmp_path, capture_output=True, text=True, timeout=120)
         assert done.returncode == 0, done.stdout + done.stderr
@@ -169,12 +168,12 @@ def test_what_is_wrong_is_said_and_ends_with_1(run, model):
     path = Path("mine/robot.toml")
     text = path.read_text()
     path.write_text(text.replace("stiffness = 32.0", "stiffness = 1.0"))
-    weak = run("robot", "check", "mine", WITHOUT_DISPLAY)
+    weak = run("robot", "check", "mine")
     assert weak.exit_code == 1
     assert "FAIL  standing: it does not stand: after 2 s its base is" in weak.stdout
     assert "the robot cannot be used yet" in weak.stdout
     path.write_text(text.replace("base_body", "base_bodi"))
-    unread = run("robot", "check", "mine", WITHOUT_DISPLAY)
+    unread = run("robot", "check", "mine")
     assert unread.exit_code == 1
     assert "FAIL  description: robot file 'mine/robot.toml': " in unread.stdout and "base_bodi" in unread.stdout
 
@@ -192,7 +191,7 @@ def test_an_unseen_robot_goes_from_its_model_to_a_score_in_five_commands(run, mo
     small = ("--backend", "mujoco", "--device", "cpu", "--num-envs", 4, "--iterations", 2, "--no-score")
     for words in (
         ("robot", "new", model, "--out", "robots/unseen"),
-        ("robot", "check", description, WITHOUT_DISPLAY),
+        ("robot", "check", description),
         ("train", "go2-flat", "--robot", description, *small),
         ("evaluate", "latest", "--suite", "demo", "--terrain", "flat", "--out", "results/unseen"),
         ("export", "latest"),

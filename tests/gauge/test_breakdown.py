@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 from gaitgauge.gauge.report.breakdown import breakdown, command_label
-from gaitgauge.gauge.report.references import reference_table, references_for
+from gaitgauge.gauge.report.references import comparable, reference_table, references_for
 from gaitgauge.gauge.result import Coverage, Run, read_result
 from gaitgauge.gauge.store import StoreError
 from gaitgauge.gauge.suite import load_suite
@@ -45,7 +45,7 @@ def test_labels_of_commands():
     assert command_label("own_goal +z") == "own goal +z"
 
 
-def result(suite="robogauge-1.1", version="1.1.0", kind="complete", score=0.6, sha="ab"):
+def result(suite="robogauge-1.1", version="1.1.0", kind="complete", score=0.6, sha="ab", **other):
     found = sample("base", **PIPELINES["base"])
     return replace(
         found,
@@ -53,17 +53,18 @@ def result(suite="robogauge-1.1", version="1.1.0", kind="complete", score=0.6, s
         coverage=Coverage(kind=kind, text=kind),
         score=score,
         policy=replace(found.policy, file_sha256=sha),
+        **other,
     )
 
 
 def test_references_are_of_the_same_suite_and_beside_whole_runs_alone():
     scores = [r.score for r in references_for(result())]
-    assert scores == [0.7307, 0.6739, 0.5148]
+    assert scores == [0.7307, 0.6739, 0.5148, 0.0801, 0.0331]
     ours = next(r for r in reference_table().reference if r.file_sha256)
-    assert [r.score for r in references_for(result(sha=ours.file_sha256))] == [0.6739, 0.5148]
+    assert [r.score for r in references_for(result(sha=ours.file_sha256))] == [0.6739, 0.5148, 0.0801, 0.0331]
     newer = [r.score for r in references_for(result(suite="robogauge-1.1.8", version="1.0.0"))]
     assert newer == [0.6984, 0.6929, 0.6828, 0.6713, 0.5786, 0.5379, 0.5054]
-    for other in ({"suite": "quick"}, {"version": "2.0.0"}, {"kind": "part"}, {"score": None}):
+    for other in ({"suite": "quick"}, {"version": "2.0.0"}, {"kind": "part"}, {"score": None}, {"backend": "newton"}):
         assert not references_for(result(**other))
     for reference in reference_table().reference:
         assert load_suite(reference.suite).version == reference.version, "the suite has moved on"
@@ -74,8 +75,24 @@ def test_references_that_were_measured_here_are_those_of_the_cards():
     cards = [read_result(path, StoreError) for path in folder.glob("*.json")]
     found = {(card.suite.name, card.policy.file_sha256): card for card in cards}
     measured = [r for r in reference_table().reference if r.file_sha256]
-    assert len(measured) == 2
     for reference in measured:
         card = found[reference.suite, reference.file_sha256]
-        assert reference.score == round(card.score, 4)
-        assert reference.interval == tuple(round(end, 4) for end in card.score_interval)
+        assert (reference.score, reference.robot) == (round(card.score, 4), card.robot)
+        assert reference.interval == (card.score_interval and tuple(round(end, 4) for end in card.score_interval))
+    current = {(name, sha) for (name, sha), c in found.items() if c.suite.version == load_suite(name).version}
+    assert {(r.suite, r.file_sha256) for r in measured} == current, "a card of a suite as it is now gives a reference"
+
+
+def test_which_scores_compare_is_said_with_an_example_that_does_not():
+    demo = comparable(result(suite="demo", version="1.0.0"))
+    assert demo == (
+        "this score compares only with scores of demo 1.0.0 for the robot go2 on the engine mujoco; other suites have other "
+        "scales: pretrained has 0.8287 on demo 1.0.0 and 0.7307 on robogauge-1.1 1.1.0"
+    )
+    go1 = comparable(result(robot="go1"))
+    assert go1 == "this score compares only with scores of robogauge-1.1 1.1.0 for the robot go1 on the engine mujoco"
+    assert [r.policy for r in references_for(result(robot="go1"))] == ["pretrained-go1"]
+    part = replace(result(), coverage=Coverage(kind="part", text="2 of 7 terrains"))
+    assert comparable(part).startswith(
+        "this score compares only with runs of the same part (2 of 7 terrains) of robogauge-1.1"
+    )

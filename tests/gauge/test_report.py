@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 from gaitgauge.api import ResultsError, load_results
 from gaitgauge.gauge.coverage import notes
-from gaitgauge.gauge.report.page import CLIP, metric_matrix, render, sources, warnings, write_report
+from gaitgauge.gauge.report.page import CLIP, FELL_AT_LIMIT, metric_matrix, render, sources, warnings, write_report
 from gaitgauge.gauge.result import Health, Statistics
 from gaitgauge.gauge.store import StoreError
 from gaitgauge.studies.compare.comparison import ComparisonError, compare, load_result
@@ -143,7 +143,29 @@ def test_directions_commands_and_references_are_shown(stress):
     page = Page(render(stress))
     for words in ("turning left", "there and back: forward and right", "0.6739", "go2_moe_cts_137k_0.6739"):
         assert words in page.text
-    assert "others, on the same suite" not in Page(render(sample("base", **PIPELINES["base"]))).text
+    assert "for comparison: others" in page.text
+    assert "for comparison: others" not in Page(render(sample("base", **PIPELINES["base"]))).text
+
+
+def test_warnings_come_after_the_score_and_in_proportion(stress):
+    """The shipped policy's page opened with a fall at its own limit, as loud as a divergence, before the score."""
+    rows = [replace(r, falls=0, self_contact=0.0) for r in stress.environments]
+    flat, climbs = next(r for r in rows if r.search is None), [r for r in rows if r.search is not None]
+    climbs[0] = replace(climbs[0], falls=1)
+    health = Health(episodes=3, falls=1, diverged=0, overflowed=0, self_contact=0.004)
+    limit, touching = warnings([flat, *climbs], health)
+    assert (limit["severity"], limit["meaning"]) == ("note", FELL_AT_LIMIT)
+    assert (touching["severity"], touching["headline"]) == (
+        "slight",
+        "parts of the robot touch each other in 0.4 % of the samples",
+    )
+    assert warnings([replace(flat, falls=1)], health)[0]["severity"] == "grave", (
+        "flat ground has no limit to search for"
+    )
+    assert warnings(climbs, replace(health, falls=2))[0]["severity"] == "grave", "more than half of the episodes"
+    assert warnings([flat], replace(health, falls=0, self_contact=0.02))[0]["severity"] == "note"
+    text = render(replace(stress, health=health, environments=(flat, *climbs)))
+    assert text.index('class="score"') < text.index("1 fall in 3") < text.index("<h2>Terrains")
 
 
 @pytest.mark.parametrize("place", ["path", "command", "terrain", "host", "provenance", "version", "suite"])

@@ -6,7 +6,7 @@ from dataclasses import asdict, replace
 
 import pytest
 from gaitgauge.gauge.suite import load_suite
-from gaitgauge.studies.trials.page import view
+from gaitgauge.studies.trials.page import speeds, view
 from gaitgauge.studies.trials.scenario import Payload, ScenarioError, load_scenario, scenario_names, scenario_text
 from gaitgauge.studies.trials.trialling import profile
 
@@ -41,7 +41,12 @@ def test_every_scenario_that_ships_can_be_loaded_and_has_ground():
 @pytest.mark.parametrize(("name", "ours"), [("lateral-impulse", (18, 20)), ("obstacle-30cm", (17, 20))])
 def test_what_the_paper_reports(name, ours):
     reported = {r.who: (r.successes, r.trials) for r in load_scenario(name).reported}
-    assert reported["Ours"] == ours and set(reported) == {"Ours", "Built-in RL", "CTS", "HIM", "DreamWaQ"}
+    assert reported["the paper's MoE-CTS"] == ours
+    assert set(reported) == {"the paper's MoE-CTS", "Built-in RL", "CTS", "HIM", "DreamWaQ"}
+
+
+def test_nobody_elses_robot_is_called_ours():
+    assert not [r.who for name in scenario_names() for r in load_scenario(name).reported if r.who.lower() == "ours"]
 
 
 def test_the_ground_of_the_shipped_scenarios_is_what_their_titles_say():
@@ -238,9 +243,21 @@ def test_ways_are_seen_from_the_side_where_the_ground_has_a_shape_and_from_above
     result = {"rows": [{"path": path, "outcome": "fell", "seed": 3, "seconds": 1.0}]}
     above = view({"profile": []}, result)
     [way] = above["paths"]
-    assert not above["side"] and len(way["points"]) == 2 and way["title"] == "seed 3: fell after 1.0 s"
+    assert above["kind"] == "above" and len(way["points"]) == 2 and way["title"] == "seed 3: fell after 1.0 s"
     assert way["points"][1][1] > way["points"][0][1]  # to the right is downwards
     side = view({"profile": [(-1.0, 0.0), (3.0, 0.0)]}, result)
-    assert side["side"] and side["paths"][0]["points"][1][1] < side["paths"][0]["points"][0][1]
+    assert side["kind"] == "side" and side["paths"][0]["points"][1][1] < side["paths"][0]["points"][0][1]
     (left, _), (right, _) = side["ground"]
     assert right - left == pytest.approx(side["size"][0] - 2 * 34.0)
+
+
+def test_a_sprint_is_drawn_as_speed_over_time_with_the_speed_to_reach():
+    """Robots that nobody steers drew a scribble from above."""
+    path = [(0.0, 0.0, 0.3, 0.0), (0.3, 0.4, 0.3, 0.0), (0.3, 0.6, 0.3, 0.0)]
+    assert speeds(path) == [pytest.approx((0.05, 5.0)), pytest.approx((0.15, 2.0))]
+    rows = [{"path": path, "outcome": "missed", "seed": 0, "seconds": 0.3}]
+    drawn = view({"profile": [], "success": {"speed": 4.0}}, {"rows": rows})
+    [way] = drawn["paths"]
+    (early, fast), (late, slow) = way["points"]
+    assert drawn["kind"] == "speed" and early < late and fast < drawn["wanted"] < slow
+    assert [t["text"] for t in drawn["values"]][::2] == ["0", "1", "2", "3", "4", "5"]
