@@ -15,7 +15,7 @@ from .console import Terminal, make_table, print_json
 from .errors import UserError
 
 if TYPE_CHECKING:
-    from ..policy.contract import Part, PolicyContract
+    from ..policy.contract import ObservationTerm, Part, PolicyContract
     from .requests import ImportRequest, ShowRequest
 
 _HASH = 12
@@ -90,6 +90,7 @@ def show_contract(request: ShowRequest) -> None:
 
 def contract_table(contract: PolicyContract) -> Table:
     """Return a policy contract as a table for people."""
+    from ..policy.observation_table import HEIGHT_SCAN
     from ..policy.robot_of import REMEMBERED
 
     table = Table(show_header=False)
@@ -107,6 +108,8 @@ def contract_table(contract: PolicyContract) -> Table:
         "damping [N·m·s/rad]": _numbers(contract.damping),
         "control period [s]": f"{contract.control_period:g}",
         "observation": ", ".join(f"{t.name} × {_numbers(t.scale)}" for t in contract.observation),
+        "height scan": next((_scan(t) for t in contract.observation if t.name == HEIGHT_SCAN), None),
+        "targets of velocity [rad/s]": ", ".join(contract.velocity_joints) or None,
         "history": "current frame" if history.length == 1 else frames,
         "layout": "; ".join(map(_part, contract.layout)) or None,
         "encoder": None if (e := contract.encoder) is None else f"{e.file}, its output {e.latent}",
@@ -120,6 +123,12 @@ def contract_table(contract: PolicyContract) -> Table:
         if value is not None:
             table.add_row(name, value)
     return table
+
+
+def _scan(term: ObservationTerm) -> str:
+    """Return the grid of a height scan in words."""
+    (length, width), (along, across) = term.size, term.grid
+    return f"{along} by {across} points on {length:g} by {width:g} m, neighbours along {term.fastest}"
 
 
 def _part(part: Part) -> str:

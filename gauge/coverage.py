@@ -77,10 +77,10 @@ def suite_label(result: Result) -> str:
 
 
 def score_label(result: Result) -> str:
-    """Return the name of a score: bare only where it is the suite's, of a policy that a robot could carry."""
+    """Return the name of a score: bare only where it is the suite's, of a policy that a robot with encoders and gyroscope could carry."""
     covered = result.coverage
-    privileged = result.policy.kind_of_observations == "privileged"
-    return ("privileged " if privileged else "") + {
+    kind = result.policy.kind_of_observations
+    return (f"{kind} " if kind in ("privileged", "exteroceptive") else "") + {
         COMPLETE: "score",
         PART: f"score of a part ({covered.text})",
         CUSTOM: f"score of a custom run ({covered.text})",
@@ -94,6 +94,8 @@ def notes(result: Result) -> list[str]:
     if result.policy.kind_of_observations == "privileged":
         terms = ", ".join(t for t in result.policy.observations or () if t in PRIVILEGED_TERMS)
         found.append(f"privileged observations: no sensor of a robot measures {terms}")
+    if result.policy.kind_of_observations == "exteroceptive":
+        found.append("exteroceptive observations: a robot needs a map of the ground for them; a simulated one was seen")
     found += [s] if (s := beyond_in_words(result.commands.limits, result.commands.beyond)) else []
     return found + ([result.motors.note] if result.motors.note else [])
 

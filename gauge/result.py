@@ -283,7 +283,7 @@ class PolicyName(Table):
     file_sha256: Text
     observations: Annotated[tuple[Text, ...], Field(max_length=1000)] | None = None
     """Terms of the observation; None in results that do not say."""
-    kind_of_observations: Literal["measurable", "privileged"] | None = None
+    kind_of_observations: Literal["measurable", "exteroceptive", "privileged"] | None = None
     provenance: Mapping[str, JsonValue] = field(default_factory=dict)
     """The origin of the policy, as its file has it."""
     assumptions: Annotated[tuple[_Words, ...], Field(max_length=100)] = ()

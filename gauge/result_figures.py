@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ..files.parsing import edited, one_line, shown
-from ..policy.contract import PRIVILEGED_TERMS
+from ..policy.contract import EXTEROCEPTIVE_TERMS, PRIVILEGED_TERMS
 from .episodes import QUALITY, Episode, Record
 from .pipelines import PIPELINES, Environment
 from .plan import PlanRules, plan
@@ -114,11 +114,13 @@ def _said(value: Any) -> str:
 def _check_statements(result: Result, source: str, error: type[Exception]) -> None:
     """Check what every evaluation states beside figures; raise ``error`` on the first that is left out or contradicts another."""
     policy, motors, digests = result.policy, result.motors, result.provenance.digests
-    privileged = "privileged" if {*(policy.observations or ())} & {*PRIVILEGED_TERMS} else "measurable"
+    terms = {*(policy.observations or ())}
+    own = {"privileged": PRIVILEGED_TERMS, "exteroceptive": EXTEROCEPTIVE_TERMS}
+    least = next((kind for kind, names in own.items() if terms & {*names}), "measurable")
     rules = {
         "policy.observations is empty": bool(policy.observations),
-        f"policy.kind_of_observations is {shown(policy.kind_of_observations)}, but its observations are {privileged}": (
-            privileged != "privileged" or policy.kind_of_observations == privileged
+        f"policy.kind_of_observations is {shown(policy.kind_of_observations)}, but its observations are {least}": (
+            least == "measurable" or policy.kind_of_observations in (least, "privileged")
         ),
         "policy.contract_hash is no SHA-256": bool(re.fullmatch("[0-9a-f]{64}", policy.contract_hash)),
         "policy.file_sha256 is no SHA-256": bool(re.fullmatch("[0-9a-f]{64}", policy.file_sha256)),

@@ -132,6 +132,12 @@ class Noise:
     """Of each component of the direction of gravity in the body frame, a unit vector."""
     base_linear_velocity: _Noise = 0.0
     """[m/s]; no robot measures it, and a policy that is told it counts as privileged all the same."""
+    height_scan: _Noise = 0.02
+    """Of each height of the map of the ground [m]; the published stream has none."""
+    map_delay: Annotated[float, Field(ge=0.0, le=1.0)] = 0.06
+    """Age of the map of the ground when the policy sees it [s], in whole control periods."""
+    map_cell: Annotated[float, Field(ge=0.01, le=1.0)] = 0.05
+    """Cell of the map of the ground [m]; the nearest node counts."""
     latency: Annotated[int, Field(ge=0)]
     """Largest delay of an action in substeps; drawn anew at every control step, 0 to this, uniformly."""
     stream: Literal["reference", "counter"]
@@ -276,6 +282,9 @@ _ADDED: Mapping[str, Any] = {
     "physics.torque_speed_limit": False,
     "noise.projected_gravity": 0.0,
     "noise.base_linear_velocity": 0.0,
+    "noise.height_scan": 0.02,
+    "noise.map_delay": 0.06,
+    "noise.map_cell": 0.05,
     "metrics.foot_force": 0.0,
     "metrics.flight": "left-out",
     "metrics.measure": "fixed",

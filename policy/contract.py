@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property
@@ -18,7 +19,7 @@ from pydantic import Field
 
 from ..files.parsing import LARGEST, Text, build, check_fields, parse_json, shown
 from ..robots.base import Angle, Damping, Robot, Speed, Stiffness
-from .observation_table import OBSERVATIONS, STANDARD, ObservationError, observation
+from .observation_table import HEIGHT_SCAN, OBSERVATIONS, STANDARD, ObservationError, observation
 
 SCHEMA_VERSION: Literal[1] = 1
 HistoryOrder = Literal["frame-major", "term-major", "frame-major-newest-first", "term-major-newest-first"]
@@ -29,6 +30,9 @@ PER_ENTRY = ("scale", "clip", "reference")
 """Fields of a term with one value, or a value for each of its entries."""
 PRIVILEGED_TERMS = tuple(each.name for each in OBSERVATIONS.values() if each.privileged)
 """The project's own observation terms that no sensor of a robot measures."""
+EXTEROCEPTIVE_TERMS = tuple(each.name for each in OBSERVATIONS.values() if each.exteroceptive)
+"""The project's own observation terms that look at the ground."""
+KindOfObservations = Literal["measurable", "exteroceptive", "privileged"]
 
 PHYSICS, ASSUMPTIONS, ASSUMED = "physics", "assumptions", "assumed"
 """Entries of a contract's provenance: ``trained`` and ``tuned``, lists of engines with version and settings; a list of sentences on what
@@ -44,6 +48,7 @@ _MOST = 1000
 _LATER = frozenset(
     {"action_offset", "layout", "memory", "encoder", "velocity_joints"}
     | {"reference", "values", "period", "offsets", "waves", "at_rest"}
+    | {"size", "spacing", "fastest"}
 )
 """Fields that hashes of older contracts lack."""
 REPEATABLE = ("gait_phase", "constant")
@@ -54,6 +59,7 @@ _ActionScale = Annotated[float, Field(strict=True, ge=-100.0, le=100.0)]
 _Factor = Annotated[float, Field(strict=True, ge=-1e6, le=1e6)]
 _Clip = Annotated[float, Field(strict=True, gt=0.0, le=1e9)]
 _Target = Annotated[float, Field(strict=True, ge=-1_000.0, le=1_000.0)]
+_Extent = Annotated[float, Field(strict=True, ge=0.0, le=20.0)]
 _Period = Annotated[float, Field(strict=True, ge=0.0005, le=1.0)]
 
 
@@ -82,6 +88,13 @@ class ObservationTerm:
     """Of ``gait_phase``, while the command is below ``RESTING``: the clock runs, holds still, has entries of zero, or all clocks
     stand at half a cycle and begin anew afterwards."""
 
+    size: tuple[_Extent, _Extent] = (1.6, 1.0)
+    """Of ``height_scan``: length along the heading and width of the grid of points about the base [m]."""
+    spacing: Annotated[float, Field(strict=True, ge=0.01, le=10.0)] = 0.1
+    """Of ``height_scan``: distance between neighbouring points [m]."""
+    fastest: Literal["x", "y"] = "x"
+    """Of ``height_scan``: axis of neighbouring entries, along the heading (``x``) or across it; both ascend."""
+
     def __post_init__(self) -> None:
         check_fields(self, "contract", ContractError)
         try:
@@ -92,6 +105,10 @@ class ObservationTerm:
             raise ContractError(f"contract: observation.{self.name} has values; only constant and command do")
         if self.name == "constant" and not self.values:
             raise ContractError("contract: observation.constant has no values; give a list of numbers")
+        if math.prod(self.grid) > _MOST:
+            raise ContractError(
+                f"contract: observation.{self.name} has {math.prod(self.grid)} points; at most {_MOST} are"
+            )
         if (self.period is None) == (self.name == "gait_phase"):
             wrong = (
                 "has no period; give the time of a gait cycle [s]"
@@ -100,8 +117,15 @@ class ObservationTerm:
             )
             raise ContractError(f"contract: observation.{self.name} {wrong}")
 
+    @property
+    def grid(self) -> tuple[int, int]:
+        """Return the numbers of points of ``height_scan`` along the heading and across it."""
+        return round(self.size[0] / self.spacing) + 1, round(self.size[1] / self.spacing) + 1
+
     def width(self, joints: int) -> int:
         """Return the number of entries for a robot of so many joints."""
+        if self.name == HEIGHT_SCAN:
+            return math.prod(self.grid)
         if self.name == "gait_phase":
             return len(self.offsets) * len(self.waves)
         if self.name == "constant":
@@ -257,6 +281,12 @@ class PolicyContract:
         return tuple(term.width(self.num_joints) for term in self.observation)
 
     @cached_property
+    def scan_points(self) -> int:
+        """Return the number of points of the height scan, 0 without one."""
+        widths = zip(self.observation, self.term_widths, strict=True)
+        return sum(width for term, width in widths if term.name == HEIGHT_SCAN)
+
+    @cached_property
     def frame_width(self) -> int:
         """Return the width of one observation frame."""
         return sum(self.term_widths)
@@ -331,9 +361,12 @@ class PolicyContract:
         return hashlib.sha256(json.dumps(data, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
 
 
-def kind_of_observations(contract: PolicyContract) -> Literal["measurable", "privileged"]:
-    """Return whether a robot's sensors can measure every observation of a policy."""
-    return "privileged" if any(observation(t.name).privileged for t in contract.observation) else "measurable"
+def kind_of_observations(contract: PolicyContract) -> KindOfObservations:
+    """Return whether a robot's sensors can measure every observation of a policy, and whether it looks at the ground."""
+    seen = [observation(t.name) for t in contract.observation]
+    if any(each.privileged for each in seen):
+        return "privileged"
+    return "exteroceptive" if any(each.exteroceptive for each in seen) else "measurable"
 
 
 def check_robot(contract: PolicyContract, robot: Robot) -> tuple[int, ...]:

@@ -9,7 +9,8 @@ import torch
 from ..backends.base import PhysicsState
 from ..robots.base import Robot
 from .contract import RESTING, ContractError, ObservationTerm, PolicyContract, check_robot
-from .observation_table import OBSERVATIONS, Observation, observation
+from .ground import Ground, HeightScan
+from .observation_table import HEIGHT_SCAN, OBSERVATIONS, Observation, observation
 
 
 class ObservationBuilder:
@@ -21,7 +22,12 @@ class ObservationBuilder:
     """
 
     def __init__(
-        self, contract: PolicyContract, robot: Robot, num_episodes: int, device: torch.device | str = "cpu"
+        self,
+        contract: PolicyContract,
+        robot: Robot,
+        num_episodes: int,
+        device: torch.device | str = "cpu",
+        ground: Ground | None = None,
     ) -> None:
         """Prepare buffers and index maps.
 
@@ -29,9 +35,10 @@ class ObservationBuilder:
             robot: the robot; the physics uses its joint order.
             num_episodes: number of rows N.
             device: where the physics' tensors live.
+            ground: what a ``height_scan`` reads; None for policies without one.
 
         Raises:
-            ContractError: the policy is not for this robot.
+            ContractError: the policy is not for this robot, or sees the ground where there is none.
         """
         index = check_robot(contract, robot)
         self.contract, self.num_episodes, self.device = contract, num_episodes, torch.device(device)
@@ -61,6 +68,14 @@ class ObservationBuilder:
         self._limit = None if all(t.clip is None for t in contract.observation) else torch.cat(limits)
         self._references = [self._reference(term) for term in contract.observation]
         self._values = [self._tensor(t.values).expand(num_episodes, -1) for t in contract.observation]
+        self._scans: dict[int, HeightScan] = {}
+        for i, term in enumerate(contract.observation):
+            if term.name == HEIGHT_SCAN:
+                if ground is None:
+                    raise ContractError(
+                        "the policy observes the ground (height_scan), which nothing shows it here; take a policy without it"
+                    )
+                self._scans[i] = HeightScan(term, ground, num_episodes, contract.control_period)
         self._clock_offsets = [self._tensor(t.offsets) for t in contract.observation]
         self._clocks = torch.zeros(num_episodes, len(contract.observation), device=self.device)
         places = tuple(place for places in contract.inputs.values() for place in places)
@@ -80,6 +95,8 @@ class ObservationBuilder:
 
     def reset(self, episodes: torch.Tensor | None = None) -> None:
         """Forget the past frames of the masked episodes, (N,) bool, None for all; their gait clocks begin anew."""
+        for scan in self._scans.values():
+            scan.reset(episodes)
         if episodes is None:
             self._frames.zero_()
             self._clocks.zero_()
@@ -142,7 +159,7 @@ class ObservationBuilder:
             return self._phase(number, command)
         if made.name == "constant":
             return self._values[number]
-        value = made.build(state, command, last_action)
+        value = self._scans[number](state) if number in self._scans else made.build(state, command, last_action)
         if made.name == "command" and self.contract.observation[number].values:
             value = torch.cat((value, self._values[number].to(value.dtype)), dim=1)
         if noise is not None:

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from ..backends.base import PhysicsState
 
 GROUP = "gaitgauge.observations"
+HEIGHT_SCAN = "height_scan"
+"""Height of the base over the ground at points of a grid about it, which turns with the heading."""
 WITHOUT_WHEELS = "joint_pos_rel_without_wheel"
 """robot_lab's angles of joints, those of wheels being zero."""
 _WIDEST = 1000
@@ -56,6 +58,8 @@ class Observation:
     """Factors of training codes, none first, then those of legged_gym and Isaac Lab; ``doctor`` tries them."""
     privileged: bool = False
     """No sensor of a robot measures it."""
+    exteroceptive: bool = False
+    """A map of the ground gives it, which cameras or lidars make; boards rank policies that see it apart."""
     foreign_names: tuple[str, ...] = ()
     """Names in Isaac Lab, mjlab and ``deploy.yaml``; exports write the first one."""
     policy_order: bool = False
@@ -220,7 +224,16 @@ _OWN = (
         mirror=(-1.0,),
         foreign_names=("command_ang_vel",),
     ),
-    # The next two have no function of the state: the builder makes them of what the contract's term says.
+    # The next three have no function of the state alone: the builder makes them of what the contract's term says.
+    Observation(
+        name=HEIGHT_SCAN,
+        build=lambda state, command, last_action: state.base_position_w[:, 2:],
+        width=1,
+        unit="m",
+        noise="height_scan",
+        foreign_names=("height_scan", "height_scanner"),
+        exteroceptive=True,
+    ),
     Observation(
         name="gait_phase",
         build=lambda state, command, last_action: command[:, :2],

@@ -17,6 +17,7 @@ from ..gauge.play.noise import NoiseReader, make_stream
 from ..gauge.suite import Noise
 from ..policy.base import Policy, PolicyError, PolicySession
 from ..policy.batch_invariance import steady_session
+from ..policy.ground import Ground
 from ..policy.observation import ObservationBuilder
 
 
@@ -53,10 +54,14 @@ class Walk:
             on_cpu = device.type == "cpu"
             session = steady_session(policy, count)[0] if on_cpu else policy.session(count, device=str(device))
         self._session = session
-        self._builder = ObservationBuilder(policy.contract, robot, count, device)
+        contract, maps = policy.contract, {} if noise is None else {"cell": noise.map_cell, "delay": noise.map_delay}
+        where = torch.tensor(backend.scene.terrain_index, device=device)
+        ground = Ground.of(contract, backend.scene.terrains, where, **maps)
+        self._builder = ObservationBuilder(contract, robot, count, device, ground)
         self._noise: NoiseReader | None = None
         if noise is not None:
-            self._noise = NoiseReader(make_stream(noise, robot.num_joints, count, device), count, device)
+            stream = make_stream(noise, robot.num_joints, count, device, scan=contract.scan_points)
+            self._noise = NoiseReader(stream, count, device)
             self._noise.begin(range(count), episodes, [0] * count, steps)
         self._action = torch.zeros(count, policy.contract.num_joints, device=device)
         self._latency: torch.Tensor | None = None

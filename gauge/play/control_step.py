@@ -12,6 +12,7 @@ import torch
 from ...backends.base import BackendError, PhysicsBackend, ResetState, Scene, unsupported
 from ...policy.base import Policy
 from ...policy.batch_invariance import steady_session
+from ...policy.ground import Ground
 from ...policy.observation import ObservationBuilder
 from ...robots.body_plan import total_mass
 from ..episodes import Episode
@@ -93,13 +94,16 @@ class ControlStep(ABC):
             self.session, self.few_rows_suffice = steady_session(policy, count)
         else:
             self.session, self.few_rows_suffice = policy.session(count, device=str(device)), False
-        self.builder = ObservationBuilder(policy.contract, scene.robot, count, device)
+        self.buffers = WorldBuffers.allocate(count, policy.contract.num_joints, device, dtype)
+        contract, noise = policy.contract, suite.noise
+        maps = {"cell": noise.map_cell, "delay": noise.map_delay}
+        ground = Ground.of(contract, scene.terrains, self.buffers.terrain_index, **maps)
+        self.builder = ObservationBuilder(contract, scene.robot, count, device, ground)
         self.schedule = Schedule(suite, device, dtype)
         self.rules = SegmentRules(suite, self.schedule)
-        self.stream = make_stream(suite.noise, scene.robot.num_joints, count, device)
+        self.stream = make_stream(noise, scene.robot.num_joints, count, device, scan=contract.scan_points)
         weight = GRAVITY * total_mass(scene.robot)
         self.samples = SampleTable(suite, scene.robot, weight, backend.state, one_by_one=one_by_one)
-        self.buffers = WorldBuffers.allocate(count, policy.contract.num_joints, device, dtype)
         commands = suite.commands
         fastest = max(commands.target_speed.values(), default=0.0)
         # velocity goals keep to the limits, and so does the way to the target unless the suite is an odd one

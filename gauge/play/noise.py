@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from ...policy.observation_table import OBSERVATIONS
+from ...policy.observation_table import HEIGHT_SCAN, OBSERVATIONS
 from ..episodes import Episode
 from ..suite import Noise
 
@@ -124,12 +124,14 @@ _COUNTER_ORDER = (
 class CounterStream(NoiseStream):
     """A hash of (episode, control step, index): every episode has a stream of its own, with no state to carry."""
 
-    def __init__(self, noise: Noise, joints: int, worlds: int, device: torch.device) -> None:
+    def __init__(self, noise: Noise, joints: int, worlds: int, device: torch.device, *, scan: int = 0) -> None:
+        """Prepare numbers for K worlds; ``scan``: points of the height scan, 0 for none."""
         self._noise = noise
         self._key = torch.zeros(worlds, dtype=torch.int64, device=device)
+        without = {*_COUNTER_ORDER} if scan else {*_COUNTER_ORDER, HEIGHT_SCAN}
         noisy = [OBSERVATIONS[name] for name in _COUNTER_ORDER]
-        noisy += [o for o in OBSERVATIONS.values() if o.noise is not None and o.name not in _COUNTER_ORDER]
-        self._widths = {each.name: each.width or joints for each in noisy}
+        noisy += [o for o in OBSERVATIONS.values() if o.noise is not None and o.name not in without]
+        self._widths = {each.name: scan if each.name == HEIGHT_SCAN else each.width or joints for each in noisy}
         half = [each.half_width(noise) for each in noisy for _ in range(self._widths[each.name])]
         self._half = torch.tensor(half, device=device)
         own = sum(self._widths[name] for name in _COUNTER_ORDER)
@@ -171,9 +173,13 @@ def _shift(value: torch.Tensor, bits: int) -> torch.Tensor:
     return (value >> bits) & ((1 << (64 - bits)) - 1)
 
 
-def make_stream(noise: Noise, joints: int, worlds: int, device: torch.device) -> ReferenceStream | CounterStream:
-    """Return the stream that a suite asks for."""
-    return (ReferenceStream if noise.stream == "reference" else CounterStream)(noise, joints, worlds, device)
+def make_stream(
+    noise: Noise, joints: int, worlds: int, device: torch.device, *, scan: int = 0
+) -> ReferenceStream | CounterStream:
+    """Return the stream that a suite asks for; ``scan``: points of the height scan, for which the published stream has no noise."""
+    if noise.stream == "reference":
+        return ReferenceStream(noise, joints, worlds, device)
+    return CounterStream(noise, joints, worlds, device, scan=scan)
 
 
 class NoiseReader:

@@ -194,6 +194,7 @@ def mjlab_metadata(contract: PolicyContract) -> dict[str, str]:
     names = [observation(term.name).foreign_names[:1] for term in terms]
     further = (
         contract.velocity_joints
+        or contract.scan_points
         or contract.action_offset
         or contract.layout
         or contract.memory
@@ -257,6 +258,10 @@ def deploy_settings(contract: PolicyContract, robot: Robot, *, finite_clips: boo
                 f"a deploy.yaml has one clip for all entries of an observation; '{term.name}' has {len(term.clip)}"
             )
         names = observation(term.name).foreign_names
+        if observation(term.name).exteroceptive:
+            raise ExportError(
+                f"a deploy.yaml's controller has no map of the ground, which '{term.name}' needs; leave deploy.yaml out"
+            )
         if not names:
             raise ExportError(
                 f"a deploy.yaml has no name for the observation '{term.name}'; give it foreign_names, or leave deploy.yaml out"

@@ -11,7 +11,7 @@ from ...files.parsing import parse_yaml, read_text, shown
 from ...robots.base import Robot
 from ..base import PolicyError
 from ..contract import History, ObservationTerm, Part, PolicyContract, without_wheels
-from ..observation_table import WITHOUT_WHEELS
+from ..observation_table import HEIGHT_SCAN, WITHOUT_WHEELS
 from .bodies import breadth_first, by_pattern, choose_robot, wheels_of
 from .terms import checked, clip_before_scaling, listed, symmetric
 
@@ -26,6 +26,7 @@ _FUNCTIONS = {
     "joint_vel_rel": "joint_velocity",
     "joint_vel": "joint_velocity",
     "last_action": "last_action",
+    "height_scan": HEIGHT_SCAN,
     "gait_phase": "gait_phase",
     "phase": "gait_phase",
 }
@@ -116,7 +117,7 @@ def _read(data: Mapping[str, Any], path: Path, robot: Robot) -> PolicyContract:
     default, names = [default[i] for i in index], tuple(ordered)
     gains = {entry: [values[i] for i in index] for entry, values in gains.items()}
     moved = None if list(map(float, offset)) == list(map(float, default)) else tuple(float(v) for v in offset)
-    terms, parts, longest = _observation(data["observations"]["policy"], path, names, wheels, in_order=in_order)
+    terms, parts, longest = _observation(data, path, names, wheels, in_order=in_order)
     limits, missing = _limits(data, robot)
     assumed = ["joints nearest to the base first, as Isaac Lab lists them"] if in_order else []
     if missing:
@@ -142,7 +143,7 @@ def _read(data: Mapping[str, Any], path: Path, robot: Robot) -> PolicyContract:
 
 
 def _observation(
-    group: Mapping[str, Any], path: Path, names: Sequence[str], wheels: Sequence[str], *, in_order: bool
+    data: Mapping[str, Any], path: Path, names: Sequence[str], wheels: Sequence[str], *, in_order: bool
 ) -> tuple[tuple[ObservationTerm, ...], tuple[Part, ...], int]:
     """Return the terms, the parts where histories differ, and the longest history.
 
@@ -150,7 +151,7 @@ def _observation(
         names, wheels: the policy's joints in its order, and those of them that are wheels.
         in_order: the order is Isaac Lab's own; else terms by joint must say the same one.
     """
-    terms, lengths = [], []
+    terms, lengths, group = [], [], data["observations"]["policy"]
     for name, term in group.items():
         if not isinstance(term, Mapping) or "func" not in term:
             continue  # settings of the whole group, and terms that were switched off
@@ -169,6 +170,7 @@ def _observation(
             )
         if function == WITHOUT_WHEELS:
             scale = without_wheels(scale, [joint in wheels for joint in names])
+        scan = _scan(term, data["scene"], path) if function == HEIGHT_SCAN else {}
         limit = (
             None if term.get("clip") is None else symmetric(float(term["clip"][0]), float(term["clip"][1]), name, path)
         )
@@ -177,14 +179,31 @@ def _observation(
                 name=_FUNCTIONS[function],
                 scale=scale,
                 clip=None if limit is None else clip_before_scaling(limit, scale),
-                reference=(0.0,) if function == "joint_pos" else None,
+                reference=scan.pop("reference", (0.0,) if function == "joint_pos" else None),
                 period=float(term["params"]["period"]) if _FUNCTIONS[function] == "gait_phase" else None,
+                **scan,
             )
         )
         lengths.append(max(int(group.get("history_length") or term.get("history_length") or 0), 1))
     alike = len(set(lengths)) <= 1
     parts = () if alike else tuple(Part(terms=(t.name,), length=n) for t, n in zip(terms, lengths, strict=True))
     return tuple(terms), parts, max(lengths, default=1)
+
+
+def _scan(term: Mapping[str, Any], scene: Mapping[str, Any], path: Path) -> dict[str, Any]:
+    """Return the grid of a height scan, and the height of the base that it calls zero; ``PolicyError``: it is no grid below the base."""
+    given = term.get("params") or {}
+    sensor = scene[(given.get("sensor_cfg") or {}).get("name") or "height_scanner"]
+    pattern, place = sensor["pattern_cfg"], ((sensor.get("offset") or {}).get("pos") or (0.0, 0.0, 0.0))
+    turned = sensor.get("ray_alignment", "yaw" if sensor.get("attach_yaw_only", True) else "base")
+    if "grid_pattern" not in str(pattern.get("func", "grid_pattern")) or any(place[:2]) or turned != "yaw":
+        raise PolicyError(
+            f"'{path}' has a height scan that is no grid about the base which turns with the heading; only such a grid is supported"
+        )
+    size = (float(pattern["size"][0]), float(pattern["size"][1]))
+    fastest = "x" if pattern.get("ordering", "xy") == "xy" else "y"
+    offset = float(given.get("offset", 0.5))
+    return {"size": size, "spacing": float(pattern["resolution"]), "fastest": fastest, "reference": (offset,)}
 
 
 def _limits(data: Mapping[str, Any], robot: Robot) -> tuple[tuple[float, float, float], bool]:

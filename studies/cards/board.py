@@ -19,7 +19,7 @@ from ...gauge.result import Result
 from ...gauge.suite import load_suite, suite_names
 from ...gauge.suited import suited
 from ...gauge.totals import environment_weights
-from ...policy.contract import PRIVILEGED_TERMS
+from ...policy.contract import EXTEROCEPTIVE_TERMS, PRIVILEGED_TERMS
 from ...policy.finding import shipped_policies
 from ...policy.loading import load_policy
 from ...policy.robot_of import robot_for
@@ -69,21 +69,23 @@ def write_board(folder: Path, page: Path) -> Path:
 
 
 def board_data(cards: Mapping[str, Result], folder: Path = Path()) -> list[dict[str, Any]]:
-    """Return the tables of a board, one for each suite and robot, both by digest, and engine, those with most cards first.
+    """Return the tables of a board, one for each suite and robot, both by digest, and engine, those with most cards first. Policies
+    that see the ground have tables of their own.
 
     Args:
         folder: the folder in which the command that checks a card finds the files.
 
     Returns:
-        For each table ``suite``, ``backend``, ``robot``, ``robot_digest`` (None where cards do not say), ``ranked`` (complete
-        cards, best first, with their ``rank``) and ``others`` (parts, custom runs, levels alone and policies with privileged
-        observations, which have no rank). Intervals of ranked cards cover all their scores at once with 95 %, the first one's
-        included, which is first by luck as well; ``ranks`` are the ranks that they leave possible.
+        For each table ``suite``, ``backend``, ``robot``, ``robot_digest`` (None where cards do not say), ``exteroceptive`` (its
+        policies see the ground), ``ranked`` (complete cards, best first, with their ``rank``) and ``others`` (parts, custom runs,
+        levels alone and policies with privileged observations, which have no rank). Intervals of ranked cards cover all their
+        scores at once with 95 %, the first one's included, which is first by luck as well; ``ranks`` are the ranks that they leave
+        possible.
     """
-    tables: dict[tuple[str, str, str, str, str, str | None], dict[str, Result]] = {}
+    tables: dict[tuple[str, str, str, str, str, str | None, bool], dict[str, Result]] = {}
     for name, card in cards.items():
         of = card.suite
-        key = (of.digest, of.name, of.version, card.backend, card.robot, card.robot_digest)
+        key = (of.digest, of.name, of.version, card.backend, card.robot, card.robot_digest, _sees_ground(card))
         tables.setdefault(key, {})[name] = card
     found = []
     for key, rows in sorted(tables.items(), key=lambda item: -len(item[1])):
@@ -98,12 +100,13 @@ def board_data(cards: Mapping[str, Result], folder: Path = Path()) -> list[dict[
         for entry in ranked:
             entry["ranks"] = _possible_ranks(entry, ranked)
         others = [e for e in entries if not e["ranked"]]
-        digest, called, version, backend, robot, files = key
+        digest, called, version, backend, robot, files, sees_ground = key
         place = {
             "suite": {"name": called, "version": version, "digest": digest},
             "backend": backend,
             "robot": robot,
             "robot_digest": files,
+            "exteroceptive": sees_ground,
         }
         found.append({**place, "ranked": ranked, "others": others})
     return found
@@ -112,6 +115,12 @@ def board_data(cards: Mapping[str, Result], folder: Path = Path()) -> list[dict[
 def render_board(tables: Sequence[Mapping[str, Any]]) -> str:
     """Return the page, as HTML text. The texts of cards are shown as text and never becomes markup."""
     return page_template(__file__, "board.html.j2").render(tables=tables)
+
+
+def _sees_ground(card: Result) -> bool:
+    """Return whether a policy observes the ground."""
+    stated = card.policy.kind_of_observations == "exteroceptive"
+    return stated or bool(set(card.policy.observations or ()) & set(EXTEROCEPTIVE_TERMS))
 
 
 def _ships(card: Result) -> bool:
@@ -140,6 +149,7 @@ def _entry(name: str, card: Result, folder: Path, policy: str) -> dict[str, Any]
     terms, path = card.policy.observations, card.policy.path
     found = _ships(card) or ((folder / name).parent / path).is_file()
     privileged = bool(set(terms or ()) & set(PRIVILEGED_TERMS))
+    kind = "privileged" if privileged else "exteroceptive" if _sees_ground(card) else "measurable"
     return {
         "card": name,
         "policy": policy,
@@ -148,7 +158,7 @@ def _entry(name: str, card: Result, folder: Path, policy: str) -> dict[str, Any]
         "interval": card.score_interval,
         "note": card.chance.note,
         "level": card.level,
-        "observations": "not stated" if terms is None else "privileged" if privileged else "measurable",
+        "observations": "not stated" if terms is None else kind,
         "terms": list(terms or ()),
         "coverage": card.coverage.words,
         "proved": card.proved,

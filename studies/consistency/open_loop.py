@@ -21,6 +21,7 @@ from ...gauge.motors import joint_parameters
 from ...gauge.suite import Suite
 from ...policy.base import Policy
 from ...policy.contract import PolicyContract
+from ...policy.ground import Ground
 from ...policy.observation import ObservationBuilder
 from ...robots import Robot
 from ...terrains.registry import make_terrain
@@ -141,7 +142,9 @@ def _walk(backend: PhysicsBackend, suite: Suite, policy: Policy, friction: float
     """Let the policy walk in the last world and note its targets."""
     _begin(backend, friction)
     count, last = backend.num_worlds, len(TESTS) - 1
-    builder = ObservationBuilder(policy.contract, backend.scene.robot, count, backend.device)
+    where = torch.tensor(backend.scene.terrain_index, device=backend.device)
+    ground = Ground.of(policy.contract, backend.scene.terrains, where)
+    builder = ObservationBuilder(policy.contract, backend.scene.robot, count, backend.device, ground)
     session = policy.session(count, device=str(backend.device))
     builder.reset()
     session.reset()

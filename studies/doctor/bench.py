@@ -13,6 +13,7 @@ from ...backends.registry import make_backend
 from ...gauge.suite import load_suite
 from ...policy.base import Policy
 from ...policy.contract import PolicyContract
+from ...policy.ground import Ground
 from ...policy.observation import ObservationBuilder
 from ...robots import Robot
 from ...robots.rotation import rotate_inverse, tilt
@@ -129,7 +130,12 @@ def _play(policy: Policy, tried: Sequence[Alternative | Outcome], physics: Physi
     count, device, dtype = physics.num_worlds, physics.device, physics.dtype
     used, spare = len(tried) * each, count - len(tried) * each
     rows = [slice(i * each, (i + 1) * each) for i in range(len(tried))]
-    builders = [ObservationBuilder(one.contract, robot, each, device) for one in tried]
+    where = torch.zeros(each, dtype=torch.int64, device=device)
+    grounds = [Ground.of(one.contract, physics.scene.terrains, where) for one in tried]
+    builders = [
+        ObservationBuilder(one.contract, robot, each, device, ground)
+        for one, ground in zip(tried, grounds, strict=True)
+    ]
     session = policy.session(count, device=str(device))
     _to_start(physics, [*tried, *[tried[-1]] * (spare // each)], each)
     limits = torch.tensor(policy.contract.command_limits, device=device, dtype=dtype)

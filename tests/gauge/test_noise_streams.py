@@ -108,7 +108,7 @@ def test_gravity_and_what_no_robot_measures_are_noisy_too_in_the_own_suite():
         unit = torch.stack([t[name] for t in terms]).double() / half
         assert unit.shape == (2000, 2, 3) and 0.99 < unit.abs().max() <= 1.0
         assert (unit**2).mean().item() == pytest.approx(1 / 3, abs=0.02)
-    assert terms[0].keys() == {o.name for o in OBSERVATIONS.values() if o.noise is not None}
+    assert terms[0].keys() == {o.name for o in OBSERVATIONS.values() if o.noise is not None and not o.exteroceptive}
     assert "projected_gravity_b" not in stream(REFERENCE).draw(torch.tensor([0]))[0]
 
 

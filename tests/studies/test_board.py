@@ -94,6 +94,14 @@ def test_a_robot_of_the_same_name_with_other_files_has_a_table_of_its_own():
     assert board({"old": card(0.5)})[0]["robot_digest"] is None
 
 
+def test_policies_that_see_the_ground_are_ranked_apart():
+    cards = {"1": card(0.9, observations=("command", "height_scan")), "2": card(0.8, observations=("command",))}
+    first, second = sorted(board(cards), key=lambda table: table["exteroceptive"])
+    assert [e["card"] for e in first["ranked"]] == ["2"] and [e["card"] for e in second["ranked"]] == ["1"]
+    assert second["ranked"][0]["observations"] == "exteroceptive" and second["ranked"][0]["rank"] == 1
+    assert render_board([first, second]).count("policies that see the ground</li>") == 1
+
+
 def test_privileged_observations_are_marked_and_have_no_rank():
     cards = {
         "1": card(0.9, observations=("command", "base_linear_velocity_b")),

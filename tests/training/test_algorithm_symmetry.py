@@ -1,12 +1,12 @@
 import pytest
 import torch
 from gaitgauge.robots import load_robot
+from gaitgauge.terrains.height_scan import scan_pattern
 from gaitgauge.training.algorithms.symmetry import (
     MirrorMap,
     SymmetryError,
     mirror_points,
 )
-from gaitgauge.training.environment.height_scan import scan_pattern
 from toy_training import toy_mirror
 
 

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from gaitgauge.terrains.height_scan import heading
 from gaitgauge.training.environment.configuration import (
     CommandConfiguration,
     CommandStage,
@@ -9,7 +10,6 @@ from gaitgauge.training.environment.configuration import (
     RewardConfiguration,
     TerminationConfiguration,
 )
-from gaitgauge.training.environment.height_scan import heading
 from gaitgauge_fake_engine import FakeScript
 from small_environment import gliding, idle, make
 

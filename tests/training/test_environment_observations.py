@@ -8,13 +8,13 @@ import torch
 from gaitgauge.policy.contract import History
 from gaitgauge.policy.observation import ObservationBuilder
 from gaitgauge.robots import load_robot
+from gaitgauge.terrains.height_scan import HeightRasters, heading, place_pattern, scan_pattern
 from gaitgauge.terrains.training_tiles import make_tile
 from gaitgauge.training.environment.configuration import (
     NoiseConfiguration,
     ObservationConfiguration,
     ResetConfiguration,
 )
-from gaitgauge.training.environment.height_scan import HeightRasters, heading, place_pattern, scan_pattern
 from gaitgauge.training.environment.observations import push_history
 from gaitgauge_fake_engine import FakeScript
 from scipy.spatial.transform import Rotation

@@ -13,12 +13,13 @@ from itertools import accumulate
 
 import torch
 
-from ...policy.contract import PolicyContract
-from ...policy.observation_table import Observation, observation
+from ...policy.contract import ObservationTerm, PolicyContract
+from ...policy.ground import scan_points
+from ...policy.observation_table import HEIGHT_SCAN, observation
 from ...robots.base import Robot
 from ...robots.body_plan import mirror_image
+from ...terrains.height_scan import scan_pattern
 from ..environment.configuration import ObservationConfiguration
-from ..environment.height_scan import scan_pattern
 
 
 class SymmetryError(ValueError):
@@ -110,7 +111,7 @@ def build_mirror(observations: ObservationConfiguration, *, contract: PolicyCont
         replace(robot, joint_names=contract.joint_names, default_joint_position=contract.default_joint_position)
     )
     joints = MirrorMap(torch.tensor(image.joint), torch.tensor(image.sign))
-    frame = MirrorMap.joined([_image(observation(term.name), joints) for term in contract.observation])
+    frame = MirrorMap.joined([_image(term, joints) for term in contract.observation])
     feet = MirrorMap(torch.tensor(image.foot), torch.ones(len(image.foot)))
     scan = scan_pattern(observations.scan_length, observations.scan_width, observations.scan_spacing, "cpu")
     return Mirror(
@@ -121,8 +122,11 @@ def build_mirror(observations: ObservationConfiguration, *, contract: PolicyCont
     )
 
 
-def _image(seen: Observation, joints: MirrorMap) -> MirrorMap:
+def _image(term: ObservationTerm, joints: MirrorMap) -> MirrorMap:
     """Return the mirror map of one observation. Raises SymmetryError: its mirror image is not known."""
+    seen = observation(term.name)
+    if term.name == HEIGHT_SCAN:
+        return mirror_points(scan_points(term))
     if seen.mirror is None:
         raise SymmetryError(
             f"The mirror image of the observation '{seen.name}' is not known; give it mirror, or set "

@@ -88,6 +88,8 @@ class NoiseConfiguration:
     """[rad]."""
     joint_velocity: NotNegative = 3.0
     """[rad/s]. The gauge's value; the published training used 1.5."""
+    height_scan: NotNegative = 0.05
+    """Of each height that a policy with ``height_scan`` sees [m]. The gauge adds 0.02 m."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,6 +114,8 @@ class ObservationConfiguration:
     """Height of the base over the ground that a scan entry of 0 stands for [m]."""
     scan_cell: Metres = 0.05
     """Cell of the height rasters that the scan is read from [m]; the nearest node counts."""
+    scan_delay: Annotated[float, Field(ge=0.0, le=1.0)] = 0.06
+    """Age of the map when a policy with ``height_scan`` sees it [s], in whole control periods. The gauge's value."""
     policy: tuple[str, ...] = ()
     """Observations that the policy sees behind the standard ones: names of installed ones, or ``module:name`` of a
     ``policy.observation_table.Observation`` of one's own, which this process alone knows. They become part of the policy contract."""

@@ -22,19 +22,20 @@ from ...backends.graphs import WARM_UP, RecordedFunction
 from ...backends.registry import make_backend
 from ...files.parsing import shown
 from ...policy.contract import History, ObservationTerm, PolicyContract, standard_contract
+from ...policy.observation_table import HEIGHT_SCAN
 from ...policy.robot_of import REMEMBERED
 from ...robots.base import JointParameters, Robot
 from ...robots.identity import identify
 from ...robots.loading import RobotError
 from ...robots.registry import load_robot
 from ...robots.sets import find_set
+from ...terrains.height_scan import heading
 from ..configuration import ConfigurationError
 from .commands import largest_commands
 from .configuration import EnvironmentConfiguration
 from .curriculum import assign_kinds, build_palette
 from .domain_randomization import draw_bodies, outside
 from .events import EpisodeStart
-from .height_scan import heading
 from .memory import copied, fitting, restore
 from .observations import Observations
 from .own_terms import policy_observations, resolve_own
@@ -418,9 +419,11 @@ def training_contract(
     standard = standard_contract(
         robot, history=History(start=configuration.observations.history_start), provenance=provenance
     )
-    more = tuple(
-        ObservationTerm(name=each.name, scale=each.scale) for each in policy_observations(configuration.observations)
-    )
+    seen = configuration.observations
+    more = tuple(ObservationTerm(name=each.name, scale=each.scale) for each in policy_observations(seen))
+    scan: dict[str, Any] = {"size": (seen.scan_length, seen.scan_width), "spacing": seen.scan_spacing}
+    scan |= {"reference": (seen.height_offset,), "clip": 1.0}
+    more = tuple(replace(term, **scan) if term.name == HEIGHT_SCAN else term for term in more)
     return replace(
         standard,
         observation=standard.observation + more,

@@ -14,8 +14,8 @@ from ...backends.base import PhysicsOptions, PhysicsState, ResetState
 from ...robots.base import Robot
 from ...robots.body_plan import joint_ranges
 from ...robots.rotation import from_yaw
+from ...terrains.height_scan import HeightRasters, place_pattern, scan_pattern
 from .configuration import PushConfiguration, RandomizationConfiguration, ResetConfiguration
-from .height_scan import HeightRasters, place_pattern, scan_pattern
 from .memory import EnvironmentMemory
 from .randomness import UniformColumns
 from .terrain_configuration import TerrainConfiguration

@@ -16,8 +16,8 @@ from ...policy.contract import PolicyContract
 from ...policy.observation import ObservationBuilder
 from ...policy.observation_table import observation
 from ...robots.rotation import rotate_inverse
+from ...terrains.height_scan import HeightRasters, heading, place_pattern
 from .configuration import NoiseConfiguration, ObservationConfiguration
-from .height_scan import HeightRasters, heading, place_pattern
 from .memory import EnvironmentMemory
 from .own_terms import resolve_own
 from .randomness import UniformColumns
@@ -143,10 +143,12 @@ class Observer:
         self._settings, self._builder, self._scan, self._rasters = configuration, builder, scan, rasters
         self._torque_limit = torque_limit
         self._noise = noise_amplitude(contract, configuration.noise, scan.device)
-        self._start = contract.history.start
+        self._start, self._sees_ground = contract.history.start, contract.scan_points > 0
 
     def __call__(self, state: PhysicsState, memory: EnvironmentMemory, uniform: UniformColumns) -> Observations:
         """Observations; the noisy frame is added to the history."""
+        if self._sees_ground:
+            self._builder.reset(memory.just_reset)
         clean = self._builder.build(state, memory.command, memory.action)
         noisy = clean + uniform.signed("noise") * self._noise
         memory.history.copy_(push_history(memory.history, noisy, memory.just_reset, start=self._start))

@@ -15,15 +15,16 @@ import torch
 
 from ...backends.base import PhysicsState
 from ...policy.contract import PolicyContract
+from ...policy.ground import Ground
 from ...policy.observation import ObservationBuilder
 from ...robots.base import JointParameters, Robot
+from ...terrains.height_scan import HeightRasters, scan_pattern
 from .commands import COMMAND_COLUMNS, CommandGenerator
 from .configuration import EnvironmentConfiguration
 from .curriculum import Levels, TrainingPalette
 from .domain_randomization import MOTOR_COLUMNS, MotorParameters
 from .episode_log import METRICS, EpisodeLog
 from .events import EpisodeStart, EpisodeStarts, Latency, Push, Pushes
-from .height_scan import HeightRasters, scan_pattern
 from .memory import EnvironmentMemory
 from .observations import Observations, Observer
 from .own_terms import resolve_class
@@ -81,7 +82,6 @@ class EnvironmentStep:
         self.max_episode_length = round(configuration.episode_length / period)
         self.default_pose = torch.tensor(robot.default_joint_position, device=device)
         self.action = torch.zeros(num_envs, joints, device=device)
-        self._builder = ObservationBuilder(contract, robot, num_envs, device)
         self.scan = scan_pattern(seen.scan_length, seen.scan_width, seen.scan_spacing, device)
         reach = math.hypot(seen.scan_length, seen.scan_width) / 2
         edge = terrain.leave_distance or terrain.promotion_distance
@@ -114,14 +114,6 @@ class EnvironmentStep:
         )
         self.starts = EpisodeStarts(configuration.reset, terrain, robot=robot, rasters=rasters, device=device)
         self.pushes = Pushes(configuration.push, num_envs, control_period=period, device=device)
-        self.observer = Observer(
-            seen,
-            contract=contract,
-            builder=self._builder,
-            scan=self.scan,
-            rasters=rasters,
-            torque_limit=torch.tensor(parameters.torque_limit, device=device),
-        )
         self.log = EpisodeLog(
             rewards=self.rewards.names,
             terminations=self.terminations.names,
@@ -139,6 +131,16 @@ class EnvironmentStep:
             ends=len(self.terminations.names),
             metrics=len(METRICS),
             device=device,
+        )
+        ground = Ground(rasters, self.memory.terrain_index, delay=seen.scan_delay)
+        self._builder = ObservationBuilder(contract, robot, num_envs, device, ground)
+        self.observer = Observer(
+            seen,
+            contract=contract,
+            builder=self._builder,
+            scan=self.scan,
+            rasters=rasters,
+            torque_limit=torch.tensor(parameters.torque_limit, device=device),
         )
         self.uniform = UniformColumns(
             {

@@ -11,10 +11,10 @@ from ...backends.base import PhysicsState
 from ...robots.base import JointParameters, Robot
 from ...robots.body_plan import body_plan, joint_ranges, mirror_image
 from ...robots.rotation import rotate_inverse
+from ...terrains.height_scan import HeightRasters, heading_and_upright, place_pattern
 from ..configuration import ConfigurationError
 from .configuration import EnvironmentConfiguration
 from .curriculum import TrainingPalette
-from .height_scan import HeightRasters, heading_and_upright, place_pattern
 from .memory import EnvironmentMemory
 from .step_inputs import StepInputs
 

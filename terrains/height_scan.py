@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from ...terrains.base import Terrain
+from .base import Terrain
 
 
 class HeightRasters:
