@@ -15,6 +15,7 @@ folder. ``--commit`` says which commit played, where the machine that played had
 from __future__ import annotations
 
 import argparse
+import gzip
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -138,11 +139,8 @@ def main() -> None:
             run = arguments.folder / f"{name}-{suite}"
             result = load_result(run) if arguments.made else play(name, suite, run, arguments)
             card = card_of(result, name, repeated, arguments.commit)
-            write_atomically(
-                arguments.out / f"{run.name}.json",
-                json.dumps(card, separators=(",", ":"), ensure_ascii=False) + "\n",
-                StoreError,
-            )
+            text = json.dumps(card, separators=(",", ":"), ensure_ascii=False) + "\n"
+            write_atomically(arguments.out / f"{run.name}.json.gz", gzip.compress(text.encode(), mtime=0), StoreError)
             low, high = card["tolerance"] or (float("nan"),) * 2
             where = "" if result.complete else f" ({result.coverage.text})"
             print(f"{name} {suite}: {result.score:.4f}, a replay within {low:.4f} to {high:.4f}{where}", flush=True)

@@ -8,6 +8,7 @@ two CPU cores. ``flow.svg`` and ``packages.svg`` are drawn by hand.
 from __future__ import annotations
 
 import base64
+import gzip
 import itertools
 import json
 import os
@@ -61,7 +62,7 @@ def run(name: str, *words: str) -> str:
 def save(image: Image.Image, name: str) -> None:
     """Write a picture with as many colours as fit into ``LARGEST``."""
     for colours in (256, 128, 64, 32):
-        image.convert("RGB").quantize(colours, dither=Image.Dither.FLOYDSTEINBERG).save(MEDIA / name, optimize=True)
+        image.convert("RGB").quantize(colours, dither=Image.Dither.NONE).save(MEDIA / name, optimize=True)
         if (MEDIA / name).stat().st_size <= LARGEST:
             break
     print(f"{name}: {image.width} x {image.height}, {(MEDIA / name).stat().st_size / 1000:.0f} kB, {colours} colours")
@@ -156,7 +157,7 @@ def evaluation() -> None:
     terminal("terminal-evaluate.png", "gaitgauge evaluate pretrained --suite demo --out demo", text)
     whole = WORK / "whole"
     whole.mkdir(exist_ok=True)
-    shutil.copy(CARDS / "pretrained-robogauge-1.1.json", whole / "results.json")
+    (whole / "results.json").write_bytes(gzip.decompress((CARDS / "pretrained-robogauge-1.1.json.gz").read_bytes()))
     shutil.copy(WORK / "demo" / "clip.webp", whole / "clip.webp")
     report = write_report(whole).as_uri()
     shoot(report, "report.png", width=1000)
@@ -167,7 +168,7 @@ def evaluation() -> None:
 
 def studies() -> None:
     """Shoot the pages of a comparison, a board, field trials, a look into the latent and a study of engines."""
-    a, b = str(CARDS / "pretrained-gaitgauge-1.json"), str(CARDS / "cts-gaitgauge-1.json")
+    a, b = str(CARDS / "pretrained-gaitgauge-1.json.gz"), str(CARDS / "cts-gaitgauge-1.json.gz")
     engines = (
         "--backends",
         "mujoco,mujoco@foot_condim=3",

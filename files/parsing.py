@@ -6,10 +6,12 @@ sentence with the file, the path of the field, its value and the allowed values.
 
 from __future__ import annotations
 
+import gzip
 import json
 import re
 import reprlib
 import tomllib
+import zlib
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
@@ -84,7 +86,7 @@ def one_line(text: object, longest: int = 300) -> str:
 def bare_name(path: object) -> str:
     """Return the name of a policy, a suite or a card without folder and ending: ``pretrained-robogauge-1.1`` of its ``.json``."""
     last = re.split(r"[/\\]", str(path).rstrip("/\\"))[-1]
-    return re.sub(r"(\.gauge)?\.(pt|pth|onnx|npz|toml|json)$", "", last, flags=re.I)
+    return re.sub(r"(\.gauge)?\.(pt|pth|onnx|npz|toml|json(\.gz)?)$", "", last, flags=re.I)
 
 
 def did_you_mean(word: object, known: Collection[str]) -> str:
@@ -97,17 +99,19 @@ def did_you_mean(word: object, known: Collection[str]) -> str:
 
 
 def read_text(path: Path, what: str, error: type[Exception], *, largest: int = LARGEST) -> str:
-    """Return the text of a file, ``what`` in the sentence (``suite file``), of at most ``largest`` bytes.
+    """Return the text of a file, ``what`` in the sentence (``suite file``), of at most ``largest`` bytes; ``.gz`` is unpacked.
 
     Raises:
-        error: no such file, too large, not readable or not UTF-8.
+        error: no such file, too large, not readable, no gzip file or not UTF-8.
     """
     name = one_line(path)
     try:
         if not path.is_file():
             raise error(f"{what} '{name}' {'is not a file' if path.exists() else 'does not exist'}")
-        with path.open("rb") as file:
+        with gzip.open(path) if path.suffix == ".gz" else path.open("rb") as file:
             data = file.read(largest + 1)
+    except (gzip.BadGzipFile, EOFError, zlib.error) as problem:
+        raise error(f"{what} '{name}' cannot be read: it is damaged, or no gzip file") from problem
     except OSError as problem:
         raise error(f"{what} '{name}' cannot be read: {problem.strerror}") from problem
     if len(data) > largest:

@@ -30,14 +30,16 @@ from .verify import CardError, check_card, check_policy
 
 
 def write_board(folder: Path, page: Path) -> Path:
-    """Write the board of a folder's cards, ``*.json`` or folders of evaluations, all or nothing, into a folder that is created.
+    """Write the board of a folder's cards, all or nothing, into a folder that is created.
+
+    Cards are ``*.json``, ``*.json.gz`` and folders of evaluations.
 
     Raises:
         CardError: there is no card, one does not hold what it says it holds of a suite that ships, or names such a one and is not
             of it; or the page cannot be written.
         ComparisonError: a file that is none, or a damaged one; nothing is left out in silence.
     """
-    files = sorted([*folder.glob("*.json"), *folder.glob("*/results.json")])
+    files = sorted(file for kind in ("*.json", "*.json.gz", "*/results.json") for file in folder.glob(kind))
     if not files:
         raise CardError(f"'{folder}' holds no score cards; put results.json files or folders of evaluations there")
     cards = {str(file.relative_to(folder)): load_result(file) for file in files}

@@ -27,9 +27,9 @@ _ADVICE = "with three seeds or more (--seed 0 --seed 1 --seed 2)"
 
 
 def is_result(contestant: str) -> bool:
-    """Return whether an argument names results rather than a policy: a folder with ``results.json``, or a file that ends in ``.json``."""
+    """Return whether an argument names results, not a policy: a folder with ``results.json``, or a ``.json`` or ``.json.gz`` file."""
     path = Path(contestant)
-    return path.suffix == ".json" or (path / "results.json").is_file()
+    return path.name.endswith((".json", ".json.gz")) or (path / "results.json").is_file()
 
 
 def compare_all(

@@ -1,5 +1,6 @@
 """What stands between a stranger's text and a dataclass."""
 
+import gzip
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -150,6 +151,18 @@ def test_files_have_a_size(tmp_path):
     path.write_bytes(b"a = \xff")
     with pytest.raises(TextError, match=r"zoo file '.*zoo.toml' is not a UTF-8 text file"):
         read_text(path, "zoo file", TextError)
+
+
+def test_packed_files_are_read_and_have_the_same_size(tmp_path):
+    path, packed = tmp_path / "card.json.gz", gzip.compress(b"a" * 1000)
+    path.write_bytes(packed)
+    assert read_text(path, "card", TextError) == "a" * 1000
+    with pytest.raises(TextError, match="larger than"):
+        read_text(path, "card", TextError, largest=999)
+    for damaged in (b"{}", packed[:-9], packed[:12] + b"\xff" * 20):
+        path.write_bytes(damaged)
+        with pytest.raises(TextError, match=r"card '.*card.json.gz' cannot be read: it is damaged, or no gzip file"):
+            read_text(path, "card", TextError)
 
 
 @pytest.mark.parametrize(

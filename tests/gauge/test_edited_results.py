@@ -44,7 +44,7 @@ def edited(tmp_path):
 
 def test_an_expected_level_is_no_edited_one():
     """A card of gaitgauge-1 was refused for levels that are no whole numbers."""
-    card = load_result(Path(__file__).parents[2] / "docs/data/scorecards/pretrained-gaitgauge-1.json")
+    card = load_result(Path(__file__).parents[2] / "docs/data/scorecards/pretrained-gaitgauge-1.json.gz")
     assert any(row.reached % 1 for row in card.environments)
 
 
@@ -280,4 +280,5 @@ def test_numpy_s_numbers_are_numbers(tmp_path):
         patch.setattr("gaitgauge.gauge.evaluate.evaluate", lambda asked, *_, **__: request.append(asked))
         with pytest.raises(StoreError):
             evaluate("pretrained", level=np.int64(3), seeds=np.arange(2), frictions=np.ones(1), out=tmp_path / "r")
-    assert json.dumps([request[0].level, *request[0].seeds, *request[0].frictions]) == "[3, 0, 1, 1.0]"
+    asked = request[0].request
+    assert json.dumps([asked.level, *asked.seeds, *asked.frictions]) == "[3, 0, 1, 1.0]"

@@ -342,7 +342,7 @@ def test_csv_of_one_seed_has_empty_ends():
 @pytest.mark.parametrize("names", [("pretrained", "standing"), pytest.param("*", marks=pytest.mark.slow)])
 def test_score_cards_that_ship_can_be_compared(suite, names):
     """Of the pretrained policy and a standing robot, and of all."""
-    paths = [path for name in names for path in sorted(SCORE_CARDS.glob(f"{name}-{suite}.json"))]
+    paths = [path for name in names for path in sorted(SCORE_CARDS.glob(f"{name}-{suite}.json*"))]
     cards = [load_result(path, intervals=False) for path in paths]
     cards = [replace(card, chance=replace(card.chance, resamples=200)) for card in cards]  # of 2000, which take seconds
     found = compare([card for card in cards if card.robot == "go2"])
