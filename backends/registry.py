@@ -194,12 +194,18 @@ def choose_device(name: str, asked: str | None = None) -> str:
     found = find_backend(name, "cpu" if asked is None else asked)
     if asked is not None:
         return asked
-    own = _OWN.get(name.partition(":")[0])
-    made_for_gpu = own is not None and own.device == "GPU"
-    if made_for_gpu and not cuda.is_available():
+    wants_gpu = made_for_gpu(name)
+    if wants_gpu and not cuda.is_available():
         change = "add --device cpu (slow), or use --backend mujoco"
         raise DeviceError(f"backend '{name}' wants a GPU and this machine has none", change)
-    return "cuda" if made_for_gpu or (own is None and _can_use_gpu(found) and cuda.is_available()) else "cpu"
+    foreign = name.partition(":")[0] not in _OWN
+    return "cuda" if wants_gpu or (foreign and _can_use_gpu(found) and cuda.is_available()) else "cpu"
+
+
+def made_for_gpu(name: str) -> bool:
+    """Return whether an engine of the project, with or without a variant, is made for a GPU."""
+    own = _OWN.get(name.partition(":")[0])
+    return own is not None and own.device == "GPU"
 
 
 def _can_use_gpu(found: type[PhysicsBackend]) -> bool:

@@ -229,10 +229,14 @@ def _scenarios() -> Table:
 def _tasks() -> Table:
     from ..training.tasks import TASKS
 
-    table = make_table("tasks (gaitgauge train NAME)", "name", "title", "worlds", "iterations", "experiment folder")
+    table = make_table(
+        "tasks (gaitgauge train NAME)", "name", "title", "engine", "worlds", "iterations", "experiment folder"
+    )
     for task in TASKS.values():
         run = task.training.run
-        table.add_row(task.name, task.title, str(task.environment.num_envs), str(run.iterations), run.experiment)
+        table.add_row(
+            task.name, task.title, task.backend, str(task.environment.num_envs), str(run.iterations), run.experiment
+        )
     return table
 
 

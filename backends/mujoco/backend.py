@@ -87,7 +87,7 @@ class MujocoBackend(PhysicsBackend):
         self._tilt_bound = 0.0 if tilt is None else 0.5 * (1.0 - np.cos(tilt))
         self._applied, self._time = self._batch.bind("xfrc_applied"), self._batch.bind("time")
         self._index_model(nominal)
-        self._randomized: dict[int, dict[str, Array]] = {}
+        self._randomized: dict[str, Array] = {}  # NaN where a world was never given one
         self._limp = np.ones(n, dtype=bool)
         self._held, self._offset, self._gain, self._kd_over_kp = (np.zeros((n, joints)) for _ in range(4))
         self._strength, self._speed = (np.ones((n, joints)) for _ in range(2))
@@ -333,12 +333,11 @@ class MujocoBackend(PhysicsBackend):
                 raise BackendError(f"Randomization.{name} has {count}; give one row for each")
         changed: set[int] = set()
         for name, value in values.items():
-            # copied, because the caller may write into its tensor later
-            for row, entry in zip(map(int, rows), value.to(torch.float64, copy=True).numpy(), strict=True):
-                known = self._randomized.setdefault(row, {})
-                if name not in known or not np.array_equal(known[name], entry):
-                    known[name] = entry
-                    changed.add(row)
+            new = value.to(torch.float64).numpy()
+            known = self._randomized.setdefault(name, np.full((self.num_worlds, *new.shape[1:]), np.nan))
+            differ = (known[rows] != new).reshape(len(rows), -1).any(axis=1)
+            known[rows[differ]] = new[differ]
+            changed.update(rows[differ].tolist())
         for row in changed:
             self._apply_randomization(row)
         self._read_gains(sorted(changed))
@@ -347,7 +346,7 @@ class MujocoBackend(PhysicsBackend):
 
     def _apply_randomization(self, row: int) -> None:
         """Write a world's randomization into its model, starting from its terrain's nominal values."""
-        values = self._randomized.get(row, {})
+        values = {name: v[row] for name, v in self._randomized.items() if not np.isnan(v[row]).any()}
         model, nominal = self._models[row], self._palette[self._terrain[row]]
         if "friction" in values:
             model.geom_friction[:, 0] = values["friction"]
@@ -377,7 +376,7 @@ class MujocoBackend(PhysicsBackend):
         model.actuator_biasprm[:, 1] = np.where(self._by_velocity | self._direct, 0.0, -model.actuator_gainprm[:, 0])
         model.actuator_biasprm[:, 2] = nominal.actuator_biasprm[:, 2] * kd_scale * strength
         model.actuator_forcerange[:] = nominal.actuator_forcerange * strength[:, None]
-        self._speed[row] = values.get("motor_speed", 1.0)
+        self._strength[row], self._speed[row] = strength, values.get("motor_speed", 1.0)
         self._offset[row] = np.where(self._by_velocity, 0.0, values.get("motor_offset", 0.0))
 
     def _read_gains(self, rows: Sequence[int] | NDArray[np.int64]) -> None:
@@ -386,7 +385,6 @@ class MujocoBackend(PhysicsBackend):
             model = self._models[row]
             gain, damping = model.actuator_gainprm[:, 0], -model.actuator_biasprm[:, 2]
             self._gain[row] = gain
-            self._strength[row] = self._randomized.get(int(row), {}).get("motor_strength", 1.0)
             self._kd_over_kp[row] = np.divide(damping, gain, out=np.zeros_like(gain), where=gain > 0)
 
     def push(

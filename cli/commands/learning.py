@@ -39,6 +39,10 @@ def train(
 
         print_settings(request)
     else:
+        from ...training.run.without_gpu import check_gpu
+
+        check_gpu(request)  # before torch is loaded
+
         from ..train import run_training
 
         run_training(replace(request, score_suite=score_suite if score else None), time)

@@ -5,6 +5,7 @@ import subprocess
 import sys
 
 import pytest
+from gaitgauge.backends.gpu import gpu_count
 from gaitgauge.cli.main import app
 from typer.main import get_command
 
@@ -44,14 +45,14 @@ for line in json.loads(sys.argv[1]):
 """
 
 
-def loaded_by(*lines: list[str]) -> list[tuple[set[str], str]]:
+def loaded_by(*lines: list[str], refused: bool = False) -> list[tuple[set[str], str]]:
     """The heavy packages that a process has loaded after each of the command lines, and what each prints."""
     done = subprocess.run(
         [sys.executable, "-c", PROGRAM, json.dumps(lines)], capture_output=True, text=True, timeout=120, check=True
     )
     found = []
     for code, modules, printed in map(json.loads, done.stdout.splitlines()):
-        assert not code, done.stderr
+        assert bool(code) is refused, done.stderr
         found.append((HEAVY & {m.partition(".")[0] for m in modules}, printed))
     assert len(found) == len(lines)
     return found
@@ -85,3 +86,9 @@ def test_lists_load_no_engine(lists, what, shown):
     loaded, printed = lists[what]
     assert loaded <= {"numpy"}
     assert shown in printed
+
+
+@pytest.mark.skipif(gpu_count() > 0, reason="this machine has a GPU")
+def test_a_training_without_its_gpu_is_refused_before_anything_heavy_is_loaded():
+    [(loaded, _)] = loaded_by(["train", "go2-flat"], refused=True)
+    assert loaded <= {"numpy"}

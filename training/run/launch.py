@@ -15,6 +15,7 @@ from typing import Any
 import torch
 
 from ...backends.registry import find_backend
+from ...files.choices import cpu_threads
 from ...files.provenance import provenance, versions
 from ...files.writing import LOCK, lock_folder
 from ...policy.contract import PHYSICS
@@ -113,7 +114,7 @@ def _environment(plan: TrainPlan, closing: ExitStack) -> TrainingEnvironment:
         replace(settings, seed=settings.seed + Processes.told().rank),
         backend=plan.backend,
         device=plan.device,
-        threads=request.threads,
+        threads=cpu_threads(request.threads),
         capture=plan.device.startswith("cuda") if request.capture is None else request.capture,
         fuse=request.fuse,
     )

@@ -30,7 +30,6 @@ from .request import TrainRequest
 from .resuming import check_environments, check_network
 from .run_directory import find_checkpoint, read_run_json, refuse_links
 
-DEFAULT_BACKEND = "mujoco-warp"
 _GAUGE_WAIT = "training.run.gauge_wait="
 _SMALL_STEPS = (
     "training.algorithm.learning_rate=0.0003",
@@ -78,7 +77,8 @@ def prepare(request: TrainRequest) -> TrainPlan:
         return resumed_run(request, request.resume)
     if request.init_from is not None:
         return run_with_weights(request, request.init_from)
-    return _checked_plan(request, _named_task(request), request.backend or DEFAULT_BACKEND)
+    task = _named_task(request)
+    return _checked_plan(request, task, request.backend or task.backend)
 
 
 def run_with_weights(request: TrainRequest, choice: str) -> TrainPlan:
@@ -97,7 +97,7 @@ def run_with_weights(request: TrainRequest, choice: str) -> TrainPlan:
             f"'{choice}' holds no teacher and no critic: the first {named.training.run.bootstrap_iterations} iterations find "
             "them for it (training.run.bootstrap_iterations)"
         )
-    plan = _checked_plan(request, task, request.backend or DEFAULT_BACKEND)
+    plan = _checked_plan(request, task, request.backend or task.backend)
     return replace(plan, weights=weights, notice=notice)
 
 

@@ -32,7 +32,7 @@ class TrainRequest:
     ] = ()
     backend: Annotated[
         str | None,
-        Choice("Physics engine, see 'gaitgauge list backends'. Default: mujoco-warp.", PLACE, values="backends"),
+        Choice("Physics engine, see 'gaitgauge list backends'. Default: the task's.", PLACE, values="backends"),
     ] = None
     device: Annotated[str | None, Choice("cpu, cuda or cuda:N; the default is what the engine is made for.", PLACE)] = (
         None
@@ -80,8 +80,11 @@ class TrainRequest:
         Choice("Compile the environment's torch parts. Default: on a GPU.", PLACE, flags=("--fuse/--no-fuse",)),
     ] = None
     threads: Annotated[
-        int, Ge(1), Le(MOST_THREADS), Choice("CPU threads of an engine that runs on the CPU.", PLACE)
-    ] = 1
+        int | None,
+        Ge(1),
+        Le(MOST_THREADS),
+        Choice("CPU threads of an engine that runs on the CPU. Default: all cores.", PLACE),
+    ] = None
     logger: Annotated[
         str | None,
         Choice(

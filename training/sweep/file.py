@@ -8,7 +8,6 @@ from typing import Literal
 
 from ...files.parsing import Name, Seed, Text, build, one_line, parse_toml, read_text
 from ...gauge.suite import SuiteError, load_suite
-from ..run.plan import DEFAULT_BACKEND
 
 NO_SUITE = "none"
 MOST_RUNS = 1000
@@ -53,7 +52,7 @@ class Sweep:
     """Each entry is trained once with each."""
     settings: tuple[Text, ...] = ()
     """``key=value`` each, of all entries."""
-    backend: Text = DEFAULT_BACKEND
+    backend: Text = "mujoco-warp"
     """Physics engine of the trainings."""
     device: Literal["cpu", "cuda"] | None = None
     """Device; None for the engine's default."""

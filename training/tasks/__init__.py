@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from types import MappingProxyType
 
+from ...backends.base import TRAINING_PHYSICS
 from ...files.parsing import one_line, shown
 from ...files.plugins import imported
 from ...robots import load_robot
@@ -17,7 +18,10 @@ from ..environment.configuration import (
     CommandConfiguration,
     CommandStage,
     EnvironmentConfiguration,
+    ObservationConfiguration,
+    PushConfiguration,
     RandomizationConfiguration,
+    ResetConfiguration,
     TerminationConfiguration,
 )
 from ..environment.reward_configuration import RewardConfiguration
@@ -38,6 +42,8 @@ class Task:
     """Settings of the environment."""
     training: TrainingConfiguration
     """Settings of the method and the run."""
+    backend: str = "mujoco-warp"
+    """Physics engine that trains it where a command names none."""
 
     def with_overrides(self, overrides: Iterable[str]) -> Task:
         """Return the task with some settings changed: ``environment.…`` and ``training.…`` keys.
@@ -172,6 +178,63 @@ def _flat() -> Task:
     return Task(name="go2-flat", title=title, environment=environment, training=training)
 
 
+def _toy() -> Task:
+    """Return a task that learns to walk straight ahead within minutes of two CPU cores: small networks, nothing randomized that a first
+    walk does not need, and large physics steps that MuJoCo takes without a look at the motors in between.
+    """
+    environment = EnvironmentConfiguration(
+        num_envs=256,
+        episode_length=10.0,
+        physics=replace(TRAINING_PHYSICS, timestep=0.01, substeps=2, torque_speed_limit=False),
+        terrain=_LEVEL_GROUND,
+        termination=TerminationConfiguration(trunk_contact=1.0, tilt=1.0),
+        observations=ObservationConfiguration(scan_length=0.4, scan_width=0.3),
+        commands=CommandConfiguration(
+            stages=(CommandStage(begin=0.0, forward=(0.3, 1.0), lateral=(0.0, 0.0), yaw=(0.0, 0.0)),),
+            dynamic=False,
+            extreme_probability=0.0,
+            heading_gain=1.0,
+            straight_probability=1.0,
+            stationary_probability=Ramp(start=0.0, end=0.0),
+        ),
+        rewards=RewardConfiguration(
+            linear_tracking=2.0, progress=1.0, yaw_tracking=0.5, action_rate=-0.005, action_smoothness=-0.005
+        ),
+        reset=ResetConfiguration(joint_scale=(0.9, 1.1), velocity=0.0),
+        randomization=RandomizationConfiguration(
+            friction=(0.5, 1.0),
+            base_mass=(0.0, 0.0),
+            link_mass=(1.0, 1.0),
+            base_com=(0.0, 0.0),
+            stiffness=(1.0, 1.0),
+            damping=(1.0, 1.0),
+            motor_offset=(0.0, 0.0),
+            motor_strength=(1.0, 1.0),
+        ),
+        push=PushConfiguration(interval=0.0),
+    )
+    network = NetworkConfiguration(
+        student_encoder="mlp",
+        latent_width=8,
+        student_hidden=(64,),
+        teacher_hidden=(64,),
+        actor_hidden=(128, 64),
+        critic_hidden=(128, 64),
+        initial_std=0.5,
+    )
+    training = TrainingConfiguration(
+        algorithm=AlgorithmConfiguration(
+            method="dreamwaq",
+            symmetry="alternate",
+            entropy_coefficient=Ramp(start=0.005, end=0.001, begin=0.3, until=0.7),
+        ),
+        network=network,
+        run=RunConfiguration(experiment="toy", iterations=150, save_interval=100, gauge_interval=0),
+    )
+    title = "Unitree Go2 on level ground, straight ahead (ten minutes of two CPU cores)"
+    return Task(name="toy", title=title, environment=environment, training=training, backend="mujoco")
+
+
 def _sprint() -> Task:
     """Return the paper's fast task: commands of up to 4.5 m/s straight ahead, so that 4 m/s is not at the limit of what was learned.
     Weights and the order of the stages are the published ones; each stage is a larger fraction of this shorter run. A robot has fallen
@@ -215,7 +278,7 @@ def _sprint() -> Task:
 
 
 TASKS: Mapping[str, Task] = MappingProxyType(
-    {task.name: task for task in (*(_on_all_terrains(*row) for row in _METHODS), _flat(), _sprint())}
+    {task.name: task for task in (*(_on_all_terrains(*row) for row in _METHODS), _flat(), _sprint(), _toy())}
 )
 """All tasks by name."""
 

@@ -1,0 +1,50 @@
+"""Say at once that a task needs a GPU that this machine lacks, and what the machine can do instead."""
+
+from __future__ import annotations
+
+from ...backends.base import DeviceError
+from ...backends.gpu import gpu_count
+from ...backends.registry import made_for_gpu
+from ...files.choices import cpu_threads
+from ..tasks import TASKS, Task, find_task
+from .request import TrainRequest
+
+_TOY = TASKS["toy"]
+_CORE_RATE = 725.0
+"""Environment steps of ``go2-flat`` that one CPU core learns from a second, a measurement: half of 1,450 on two x86-64 cores."""
+_TOY_CORE_RATE = 2500.0
+"""The same of ``toy``."""
+
+
+def check_gpu(request: TrainRequest) -> None:
+    """Refuse a new run on an engine made for a GPU where the driver has none; torch is not loaded for it.
+
+    Raises:
+        TaskError: unknown task.
+        DeviceError: no GPU; the advice says what trains here and how long it takes.
+    """
+    if request.resume is not None or request.device is not None:
+        return
+    task = find_task(request.task)
+    backend = request.backend or task.backend
+    if not made_for_gpu(backend) or gpu_count() > 0:
+        return
+    cores = cpu_threads(None)
+    slow = _time(task, _CORE_RATE, cores, request)
+    raise DeviceError(
+        f"task '{task.name}' trains on {backend}, which wants an NVIDIA GPU, and this machine has none",
+        f"'gaitgauge train toy' learns to walk here in {_time(_TOY, _TOY_CORE_RATE, cores)}, docs/start/first_training.ipynb "
+        f"trains go2-flat on a hosted GPU, and --backend mujoco trains this task here in {slow}",
+    )
+
+
+def _time(task: Task, rate: float, cores: int, request: TrainRequest | None = None) -> str:
+    """Return about how long a task, with the sizes that a request asks for, takes on some cores, for people."""
+    run = task.training.run
+    iterations, worlds = run.iterations, task.environment.num_envs
+    if request is not None:
+        iterations, worlds = request.iterations or iterations, request.num_envs or worlds
+    minutes = iterations * run.steps_per_iteration * worlds / (rate * cores) / 60.0
+    if minutes < 90.0:
+        return f"about {max(round(minutes), 1)} min"
+    return f"about {minutes / 60.0:.0f} h" if minutes < 72 * 60 else f"about {minutes / 1440.0:.0f} days"
