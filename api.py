@@ -205,11 +205,14 @@ def train(task: str, *settings: str, seconds: float | None = None, **options: An
     from .training.run.launch import train as run
     from .training.run.plan import prepare
     from .training.run.request import TrainRequest
+    from .training.run.without_gpu import check_gpu
 
     _need("a text", task=task)
     _need("several texts", settings=settings)
     known = [f.name for f in fields(TrainRequest) if f.name not in ("task", "overrides", "seconds")]
     if unknown := sorted(set(options) - set(known)):
         raise ArgumentError(f"there is no option {unknown[0]}; choose from {', '.join(known)}")
-    plan = prepare(TrainRequest(task=task, overrides=settings, seconds=seconds, **options))
+    request = TrainRequest(task=task, overrides=settings, seconds=seconds, **options)
+    check_gpu(request)
+    plan = prepare(request)
     return run(plan, began=time.monotonic())

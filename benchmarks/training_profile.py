@@ -181,7 +181,7 @@ def main() -> None:
             init_from=options.init_from,
             log_root=Path(folder),
             fuse=options.fuse,
-            score_suite=None,
+            score=False,
         )
         train(prepare(request), began=time.monotonic(), progress=progress)
         trace = Path(folder) / "trace.json"

@@ -8,19 +8,21 @@ import time as clock
 from collections import deque
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import typer
 
 from ..files.parsing import one_line
 from ..training.configuration import RunConfiguration
-from ..training.processes import Processes, told_number
-from ..training.run.launch import train
-from ..training.run.plan import TrainPlan, prepare
 from ..training.run.request import TrainRequest
 from ..training.run.stopping import Progress
+from ..training.run.without_gpu import check_gpu
 from .console import Terminal, shell_command
 from .errors import UserError
 from .progress import ProgressDisplay, duration
+
+if TYPE_CHECKING:
+    from ..training.run.plan import TrainPlan
 
 _RATE_WINDOW = 20
 """Iterations over which the speed and the time left are averaged."""
@@ -44,6 +46,10 @@ def run_training(request: TrainRequest, time: str | None) -> None:
     """Train for at most ``time``, show progress, say how to go on, and exit with the run's exit code."""
     began = clock.monotonic()
     seconds = None if time is None else parse_duration(time)
+    check_gpu(request)  # before torch is loaded
+    from ..training.run.launch import train
+    from ..training.run.plan import prepare
+
     plan = prepare(replace(request, seconds=seconds))
     task = request.task
     # Of several processes, one for each GPU, the first prints.
@@ -74,6 +80,8 @@ def run_training(request: TrainRequest, time: str | None) -> None:
 
 def _start() -> tuple[str, str]:
     """Return the start of a command with as many processes as this run has, and a note on what the reader must add."""
+    from ..training.processes import Processes, told_number
+
     count = Processes.told().count
     if count == 1:
         return "gaitgauge", ""
@@ -89,13 +97,11 @@ def _again(plan: TrainPlan) -> list[str]:
     run, usual = plan.task.training.run, RunConfiguration()
     found = ["--trust"] if plan.needs_trust else []
     found += ["--logger", run.logger] if run.logger != usual.logger else []
-    for name in ("device", "threads", "capture", "fuse", "score_suite", "score_threads"):
+    for name in ("device", "threads", "capture", "fuse", "film", "score", "score_suite", "score_threads"):
         value, option = getattr(plan.request, name), name.replace("_", "-")
         if value == getattr(TrainRequest, name):
             continue
-        if name == "score_suite" and value is None:
-            found.append("--no-score")
-        elif isinstance(value, bool):
+        if isinstance(value, bool):
             found.append(f"--{option}" if value else f"--no-{option}")
         else:
             found += [f"--{option}", str(value)]

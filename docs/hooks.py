@@ -21,7 +21,6 @@ PATHS = ROOT / "build" / "package"
 def on_startup(command: str, dirty: bool) -> None:
     """Link the package before mkdocstrings looks for its folder, which must exist by then."""
     link_package()
-    os.environ["JUPYTER_CONFIG_PATH"] = str(Path(__file__).parent)  # jupyter_nbconvert_config.py
 
 
 def link_package() -> None:

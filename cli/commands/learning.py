@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Annotated
 
 import typer
 
-from ...files.choices import SCORES, SPAN, Choice
-from ...training.run.request import QUICK_SUITE, TrainRequest
+from ...files.choices import SPAN, Choice
+from ...training.run.request import TrainRequest
 from ..requests import SweepRequest
 from ..running import command
 
 app = typer.Typer()
 
-_SUITE = Choice("Suite of the scores, or a suite's .toml file.", SCORES, "suites")
 _TIME = "Stop after this wall-clock time, building included: seconds, 9m, 2h or 1h30m."
 
 
@@ -23,8 +21,6 @@ def train(
     request: TrainRequest,
     time: Annotated[str | None, Choice(_TIME, SPAN)] = None,
     list_settings: Annotated[bool, Choice("Print every setting of the task with its default, and end.")] = False,
-    score: Annotated[bool, Choice("Gauge checkpoints in a side process; best.pt is the best of them.", SCORES)] = True,
-    score_suite: Annotated[str, _SUITE] = QUICK_SUITE,
 ) -> None:
     """Train a policy; Ctrl-C or SIGTERM writes a checkpoint and says how to go on.
 
@@ -39,13 +35,9 @@ def train(
 
         print_settings(request)
     else:
-        from ...training.run.without_gpu import check_gpu
-
-        check_gpu(request)  # before torch is loaded
-
         from ..train import run_training
 
-        run_training(replace(request, score_suite=score_suite if score else None), time)
+        run_training(request, time)
 
 
 @command(app)

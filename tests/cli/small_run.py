@@ -9,4 +9,4 @@ SMALL = (
     "training.network.teacher_hidden=8",
     "training.network.student_hidden=8",
 )
-FAKE = ("--backend", "fake", "--device", "cpu", "--num-envs", 8, "--no-score")
+FAKE = ("--backend", "fake", "--device", "cpu", "--num-envs", 8, "--no-score", "--no-film")

@@ -188,7 +188,7 @@ def test_the_picture_is_a_png(refused):
 def test_an_unseen_robot_goes_from_its_model_to_a_score_in_five_commands(run, model):
     """And nobody has to say again which robot it is, even when its files are gone."""
     description = "robots/unseen/robot.toml"
-    small = ("--backend", "mujoco", "--device", "cpu", "--num-envs", 4, "--iterations", 2, "--no-score")
+    small = ("--backend", "mujoco", "--device", "cpu", "--num-envs", 4, "--iterations", 2, "--no-score", "--no-film")
     for words in (
         ("robot", "new", model, "--out", "robots/unseen"),
         ("robot", "check", description),

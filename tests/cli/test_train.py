@@ -150,7 +150,7 @@ def test_bad_request(refused, arguments, named):
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without a GPU")
 def test_no_gpu(refused, tmp_path):
-    assert "--device cpu" in refused("train", "go2-flat")
+    assert "--backend mujoco trains this task here in about" in refused("train", "go2-flat")
     assert "--device cpu" in refused("train", "go2-flat", "--backend", "fake", "--device", "cuda")
     assert not (tmp_path / "logs").exists()
 
@@ -192,7 +192,7 @@ def test_full_disk_keeps_the_previous_checkpoint(run, tmp_path, monkeypatch):
     assert [f.name for f in run_directory.iterdir() if "model" in f.name] == ["model_1.pt"]
     monkeypatch.undo()
     monkeypatch.chdir(tmp_path)
-    again = run("train", "go2-flat", "--resume", "latest", "--no-score")
+    again = run("train", "go2-flat", "--resume", "latest", "--no-score", "--no-film")
     assert again.exit_code == 0, again.output
     assert (run_directory / "model_3.pt").is_file()
 

@@ -15,7 +15,9 @@ from small_run import FAKE, SMALL
 
 
 def test_resume_keeps_settings_directory_and_horizon(run, trained):
-    result = run("train", "go2-flat", "--resume", trained, "--device", "cpu", "--no-score", "--iterations", 3)
+    result = run(
+        "train", "go2-flat", "--resume", trained, "--device", "cpu", "--no-score", "--no-film", "--iterations", 3
+    )
     assert result.exit_code == 0, result.output
     entries = torch.load(trained / "model_3.pt", weights_only=True)
     assert entries["iter"] == 3
@@ -27,7 +29,9 @@ def test_resume_keeps_settings_directory_and_horizon(run, trained):
 def test_carried_checkpoint_continues_in_a_new_directory(run, trained, tmp_path):
     carried = tmp_path / "model_2.pt"
     carried.write_bytes((trained / "model_2.pt").read_bytes())
-    result = run("train", "go2-flat", "--resume", carried, "--device", "cpu", "--no-score", "--iterations", 3)
+    result = run(
+        "train", "go2-flat", "--resume", carried, "--device", "cpu", "--no-score", "--no-film", "--iterations", 3
+    )
     assert result.exit_code == 0, result.output
     (new,) = (tmp_path / "logs" / "rsl_rl" / "go2_flat").iterdir()
     assert [f.name for f in new.glob("model_*.pt")] == ["model_3.pt"]
@@ -38,7 +42,17 @@ def test_an_earlier_checkpoint_goes_on_in_a_directory_of_its_own(run, trained, t
     """Or the run's last checkpoint, for --resume, latest and play, would be the other branch's."""
     before = {f: f.read_bytes() for f in trained.rglob("*") if f.is_file()}
     (trained / "model_9.pt").write_bytes((trained / "model_2.pt").read_bytes())
-    result = run("train", "go2-flat", "--resume", trained / "model_2.pt", *FAKE[2:4], "--no-score", "--iterations", 3)
+    result = run(
+        "train",
+        "go2-flat",
+        "--resume",
+        trained / "model_2.pt",
+        *FAKE[2:4],
+        "--no-score",
+        "--no-film",
+        "--iterations",
+        3,
+    )
     (trained / "model_9.pt").unlink()
     assert result.exit_code == 0, result.output
     assert "has gone on to iteration 9: what comes of 2 has a run directory of its own" in result.output
@@ -50,7 +64,10 @@ def test_an_earlier_checkpoint_goes_on_in_a_directory_of_its_own(run, trained, t
 def test_a_run_that_is_resumed_says_what_it_is_trained_with_now(run, trained):
     before = (trained / "run.json").read_text()
     changed = ("--iterations", 3, "training.algorithm.epochs=2")
-    assert run("train", "go2-flat", "--resume", trained, "--device", "cpu", "--no-score", *changed).exit_code == 0
+    assert (
+        run("train", "go2-flat", "--resume", trained, "--device", "cpu", "--no-score", "--no-film", *changed).exit_code
+        == 0
+    )
     found, earlier = json.loads((trained / "run.json").read_text()), json.loads(before)
     (trained / "model_3.pt").unlink()
     (trained / "run.json").write_text(before)
@@ -60,7 +77,7 @@ def test_a_run_that_is_resumed_says_what_it_is_trained_with_now(run, trained):
 
 
 def test_initial_weights_from_other_settings(run, trained, tmp_path):
-    command = ("train", "go2-flat", *FAKE[:4], "--num-envs", 12, "--no-score", "--iterations", 1, *SMALL)
+    command = ("train", "go2-flat", *FAKE[:4], "--num-envs", 12, "--no-score", "--no-film", "--iterations", 1, *SMALL)
     slow = ("training.algorithm.learning_rate=1e-12", "training.algorithm.student_learning_rate=1e-12")
     fixed = ("training.algorithm.desired_kl=none", "--init-from", trained / "model_2.pt")
     result = run(*command, *slow, *fixed)
@@ -104,11 +121,11 @@ def test_trained_networks_go_on_where_their_schedules_stood(trained):
 def test_what_is_told_to_go_on_with_keeps_what_checkpoints_do_not(run, monkeypatch):
     """A run on the CPU without scores, or with another suite's, is not scored by ``quick`` on a GPU by the command that is printed."""
     chosen = ("--threads", 2, "--no-fuse", "--score-suite", "robogauge-1.1", "--score-threads", 1)
-    result = run("train", "go2-flat", *FAKE[:-1], *chosen, *SMALL, "--time", "0.5s")
+    result = run("train", "go2-flat", *FAKE[:-2], "--no-film", *chosen, *SMALL, "--time", "0.5s")
     told = " ".join(result.output.partition("--resume")[2].split())
-    assert told.endswith("--device cpu --threads 2 --no-fuse --score-suite robogauge-1.1 --score-threads 1")
+    assert told.endswith("--device cpu --threads 2 --no-fuse --no-film --score-suite robogauge-1.1 --score-threads 1")
     result = run("train", "go2-flat", *FAKE, *SMALL, "--time", "0.5s")
-    assert " ".join(result.output.partition("--resume")[2].split()).endswith("--device cpu --no-score")
+    assert " ".join(result.output.partition("--resume")[2].split()).endswith("--device cpu --no-film --no-score")
 
 
 @pytest.mark.parametrize(
@@ -217,7 +234,9 @@ def test_resuming_with_another_network(refused, trained, setting, named):
 
 
 def test_finished_run_says_what_to_give(refused, trained):
-    message = refused("train", "go2-flat", "--resume", trained / "model_2.pt", "--device", "cpu", "--no-score")
+    message = refused(
+        "train", "go2-flat", "--resume", trained / "model_2.pt", "--device", "cpu", "--no-score", "--no-film"
+    )
     assert "2 of 2 iterations" in message
     assert "--iterations" in message
 
@@ -232,7 +251,9 @@ def test_finished_run_says_what_to_give(refused, trained):
 )
 def test_a_resume_that_is_refused_changes_nothing(refused, trained, change, named):
     before = {f: f.read_bytes() for f in trained.rglob("*") if f.is_file()}
-    assert named in refused("train", "go2-flat", "--resume", trained, "--device", "cpu", "--no-score", *change)
+    assert named in refused(
+        "train", "go2-flat", "--resume", trained, "--device", "cpu", "--no-score", "--no-film", *change
+    )
     assert {f: f.read_bytes() for f in trained.rglob("*") if f.is_file()} == before
 
 
@@ -265,7 +286,7 @@ def test_two_processes_do_not_share_a_run(run, trained, monkeypatch):
     monkeypatch.setattr(writing, "_PATIENCE", 0.1)
     lock = lock_folder(trained, RuntimeError)
     before = sorted(f.name for f in trained.iterdir())
-    resume = ("train", "go2-flat", "--resume", trained, "--device", "cpu", "--no-score", "--iterations", 3)
+    resume = ("train", "go2-flat", "--resume", trained, "--device", "cpu", "--no-score", "--no-film", "--iterations", 3)
     result = run(*resume)
     assert result.exit_code == 2
     assert "another process is writing to" in result.stderr

@@ -13,7 +13,7 @@ from gaitgauge.training.run.plan import prepare
 from gaitgauge.training.run.request import TrainRequest
 from small_run import FAKE, SMALL
 
-RESUME = ("--device", "cpu", "--no-score", "--iterations", 3)
+RESUME = ("--device", "cpu", "--no-score", "--no-film", "--iterations", 3)
 
 
 def stranger(trained: Path, folder: Path, **environment: object) -> Path:
@@ -38,7 +38,7 @@ def test_functions_that_a_checkpoint_names_are_not_imported(refused, run, traine
         "event": {"events": [{k: term[k] for k in ("name", "function")}]},
     }[place]
     path = stranger(trained, tmp_path, **changed)
-    resume = ("train", "go2-flat", "--resume", path, "--device", "cpu", "--no-score", "--iterations", 3)
+    resume = ("train", "go2-flat", "--resume", path, "--device", "cpu", "--no-score", "--no-film", "--iterations", 3)
     message = refused(*resume)
     assert "'evil_code:Own'" in message and "--trust" in message
     run("import", path, tmp_path / "x.gauge.pt")
@@ -87,7 +87,9 @@ def test_the_package_vouches_for_its_own_functions_alone(name, foreign):
 def test_damaged_descriptions_of_a_run(refused, trained, tmp_path, text):
     (tmp_path / "model_2.pt").write_bytes((trained / "model_2.pt").read_bytes())
     (tmp_path / "run.json").write_text(text)
-    assert "run.json" in refused("train", "go2-flat", "--resume", tmp_path, "--device", "cpu", "--no-score")
+    assert "run.json" in refused(
+        "train", "go2-flat", "--resume", tmp_path, "--device", "cpu", "--no-score", "--no-film"
+    )
 
 
 def test_a_task_that_a_checkpoint_names_is_no_command_to_paste(refused, trained, tmp_path):

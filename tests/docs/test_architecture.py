@@ -92,5 +92,17 @@ def test_a_training_step(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     wanted = [hop for hop in hops(TITLES[1])[1:] if not hop.startswith("backends/")]  # the engine is another
     assert len(wanted) > 12
-    command = ["train", "go2-flat", *SMALL, "--backend", "fake", "--device", "cpu", "--num-envs", "8", "--no-score"]
+    command = [
+        "train",
+        "go2-flat",
+        *SMALL,
+        "--backend",
+        "fake",
+        "--device",
+        "cpu",
+        "--num-envs",
+        "8",
+        "--no-score",
+        "--no-film",
+    ]
     assert_in_order(wanted, passed([*command, "--iterations", "1"], wanted))

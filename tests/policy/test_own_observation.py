@@ -111,7 +111,18 @@ def test_files_of_others_without_a_name_for_it_are_not_written(installed):
 @pytest.mark.parametrize("setting", ["foot_load", "foot_load:FOOT_LOAD"])
 def test_a_training_uses_it_and_its_policy_plays(installed, setting, monkeypatch):
     monkeypatch.chdir(installed)
-    command = ["train", "go2-flat", "--backend", "fake", "--device", "cpu", "--num-envs", "8", "--no-score"]
+    command = [
+        "train",
+        "go2-flat",
+        "--backend",
+        "fake",
+        "--device",
+        "cpu",
+        "--num-envs",
+        "8",
+        "--no-score",
+        "--no-film",
+    ]
     done = CliRunner().invoke(
         app, [*command, "--log-root", "logs", *SMALL, f"environment.observations.policy={setting}"]
     )

@@ -56,7 +56,7 @@ def request(folder, *settings, **options):
     options = {"backend": "fake", "num_envs": 8, "iterations": 2} | options
     overrides = (*SMALL, "training.run.steps_per_iteration=4", "training.algorithm.minibatches=1", *settings)
     return TrainRequest(
-        task="go2-flat", device="cpu", log_root=folder, score_suite=None, overrides=overrides, **options
+        task="go2-flat", device="cpu", log_root=folder, score=False, film=False, overrides=overrides, **options
     )
 
 

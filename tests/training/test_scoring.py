@@ -81,7 +81,7 @@ def test_a_gauge_that_cannot_play_says_why(tmp_path):
 
 def test_a_machine_that_cannot_draw_is_told_once(tmp_path, monkeypatch):
     monkeypatch.setenv("MUJOCO_GL", "nonsense")
-    filmer = Filmer(tmp_path, terrain="flat")
+    filmer = Filmer(tmp_path, terrains=("flat",))
     filmer.submit(PRETRAINED, 20)
     videos, sentence = filmer.take(120.0)
     assert videos == []
@@ -93,11 +93,11 @@ def test_a_machine_that_cannot_draw_is_told_once(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_a_video_of_a_checkpoint(tmp_path):
-    filmer = Filmer(tmp_path, terrain="flat")
+    filmer = Filmer(tmp_path, terrains=("flat",))
     filmer.submit(PRETRAINED, 20)
     videos, sentence = filmer.take(600.0)
     if "does not draw" in sentence or "neither EGL nor OSMesa" in sentence:
         pytest.skip(sentence)
-    assert (videos, sentence) == ([(tmp_path / "videos" / f"{PRETRAINED.stem}.mp4", 20)], "")
+    assert (videos, sentence) == ([(tmp_path / "videos" / f"{PRETRAINED.stem}_flat.mp4", 20)], "")
     assert videos[0][0].stat().st_size > 10_000
     assert [f.name for f in (tmp_path / "videos").iterdir()] == [videos[0][0].name]

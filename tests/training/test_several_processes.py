@@ -24,7 +24,7 @@ SMALL = (
 )
 TRAIN = (
     *("-m", "gaitgauge.cli.main", "train", "go2-flat", "--backend", "fake", "--device", "cpu", "--num-envs", "8"),
-    *("--no-score", "--seed", "5", *SMALL),
+    *("--no-score", "--no-film", "--seed", "5", *SMALL),
 )
 SCRIPT = """
 import torch

@@ -39,9 +39,7 @@ def test_training_goes_on_from_the_go2_with_its_teacher_and_critic():
 
 
 def planned(path: Path):
-    return prepare(
-        TrainRequest(task="go2-moe-cts", init_from=str(path), backend="fake", device="cpu", score_suite=None)
-    )
+    return prepare(TrainRequest(task="go2-moe-cts", init_from=str(path), backend="fake", device="cpu", score=False))
 
 
 def test_a_policy_without_teacher_and_critic_is_told_apart(tmp_path):

@@ -239,7 +239,7 @@ def test_a_training_begins_or_goes_on(tmp_path):
     assert goes_on[4:] == [
         *("train", "go2-cts", "environment.num_envs=8", "--resume", str(directory)),
         *("--score-suite", "quick", "--score-threads", "2", "--time", "90s", "--device", "cpu"),
-        *("--log-root", str(run.folder / "logs")),
+        *("--no-film", "--log-root", str(run.folder / "logs")),
     ]
     (directory / "best.pt").touch()
     assert run.policy(SWEEP).name == "model_5.pt" and run.policy(BEST).name == "best.pt"

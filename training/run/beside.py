@@ -83,9 +83,9 @@ class Scores(Beside[Scorer]):
 class Videos(Beside[Filmer]):
     """Videos of checkpoints."""
 
-    def submit(self, checkpoint: Path | None) -> None:
-        """Ask for a video of a checkpoint."""
-        if self._side is not None and checkpoint is not None:
+    def submit(self, checkpoint: Path | None, *, last: bool = False) -> None:
+        """Ask for videos of a checkpoint, the ``last`` one of the run or another, if such are filmed."""
+        if self._side is not None and checkpoint is not None and (self._side.last if last else self._side.every):
             self._side.submit(checkpoint, self._run.iteration)
 
     def take(self, seconds: float = 0.0, stop: Callable[[], bool] = lambda: False) -> None:
@@ -95,5 +95,6 @@ class Videos(Beside[Filmer]):
         videos, sentence = self._side.take(seconds, stop)
         for video, iteration in videos:
             self._run.logger.send(video, iteration)
+            self._run.message(f"Film: {video}")
         if sentence:
             self._run.message(sentence)

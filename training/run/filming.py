@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from .side_process import CHILD_PROGRAM, Job, SideProcess
 
 VIDEO_FOLDER = "videos"
-"""Folder of a run directory that holds ``model_<iteration>.mp4``."""
+"""Folder of a run directory that holds ``model_<iteration>_<terrain>.mp4``."""
 SECONDS = 8.0
 """Length of a video [s]."""
 
@@ -16,21 +16,49 @@ SECONDS = 8.0
 class Filmer:
     """Takes checkpoints, gives videos back later."""
 
-    def __init__(self, run: Path, *, terrain: str) -> None:
-        """Film into a run directory, on a terrain of the gauge."""
+    def __init__(
+        self,
+        run: Path,
+        *,
+        terrains: Sequence[str],
+        command: Sequence[float] | None = None,
+        every: bool = True,
+        last: bool = True,
+    ) -> None:
+        """Film into a run directory.
+
+        Args:
+            terrains: terrains of the gauge; one film for each.
+            command: forward, lateral [m/s] and yaw [rad/s] speed; None for a tour that shows every direction.
+            every: film when the run's interval says so.
+            last: film at the end of the run.
+        """
+        self.every, self.last = every, last
         self._folder = run / VIDEO_FOLDER
-        self._terrain = terrain
+        self._terrains, self._command = terrains, command
+        self._submitted = -1
         self._side = SideProcess()
         self._given_up = False
 
     def submit(self, path: Path, iteration: int) -> None:
-        """Ask for a video of a checkpoint."""
-        if self._given_up:
+        """Ask for the videos of a checkpoint, once."""
+        if self._given_up or iteration == self._submitted:
             return
-        video = self._folder / f"{path.stem}.mp4"
-        options = ["--terrain", self._terrain, "--seconds", f"{SECONDS:g}", "--out", str(video)]
-        command, output = [*CHILD_PROGRAM, "play", str(path), *options], self._folder / f"{path.stem}.txt"
-        self._side.submit(Job(command=command, checkpoint=path, iteration=iteration, output=output))
+        self._submitted = iteration
+        told = ["--command", *map(str, self._command)] if self._command else []
+        for terrain in self._terrains:
+            output = self._folder / f"{path.stem}_{terrain}.txt"
+            options = [
+                "--terrain",
+                terrain,
+                "--seconds",
+                f"{SECONDS:g}",
+                "--out",
+                str(output.with_suffix(".mp4")),
+                *told,
+            ]
+            command = [*CHILD_PROGRAM, "play", str(path), *options]
+            self._side.submit(Job(command=command, checkpoint=path, iteration=iteration, output=output))
 
     def take(
         self, seconds: float = 0.0, stop: Callable[[], bool] = lambda: False
@@ -42,7 +70,7 @@ class Filmer:
         for finished in self._side.drain(seconds, stop):
             job = finished.job
             if not finished.failure:
-                films.append((self._folder / f"{job.checkpoint.stem}.mp4", job.iteration))
+                films.append((job.output.with_suffix(".mp4"), job.iteration))
                 job.output.unlink(missing_ok=True)
                 job.log.unlink(missing_ok=True)
             elif finished.failure == "skipped":

@@ -18,12 +18,11 @@ from ...backends.registry import find_backend
 from ...files.choices import cpu_threads
 from ...files.provenance import provenance, versions
 from ...files.writing import LOCK, lock_folder
-from ...policy.contract import PHYSICS
+from ...policy.contract import PHYSICS, PolicyContract
 from ...policy.finding import shipped_policies
 from ..algorithms.symmetry import build_mirror
 from ..configuration import ConfigurationError
 from ..environment.environment import TrainingEnvironment
-from ..environment.terrain_configuration import FLAT_TILE
 from ..processes import Processes, ProcessLostError, idle_gpus
 from .checkpoint import CheckpointError
 from .filming import Filmer
@@ -133,11 +132,17 @@ def _runner(
     request, task = plan.request, plan.task
     processes = Processes.join(plan.device)
     scorer = filmer = None
-    if run is not None and request.score_suite is not None and task.training.run.gauge_interval > 0:
-        scorer = Scorer(run, suite=request.score_suite, threads=request.score_threads)
-    if run is not None and task.training.run.video_interval > 0:
-        level_ground = all(tile.name == FLAT_TILE.name for tile in task.environment.terrain.tiles)
-        filmer = Filmer(run, terrain="flat" if level_ground else "stairs_fd")
+    if run is not None and plan.suite is not None:
+        scorer = Scorer(run, suite=plan.suite, threads=request.score_threads)
+    if run is not None and (request.film or task.training.run.video_interval > 0):
+        stairs = any(tile.name.startswith("stairs") for tile in task.environment.terrain.tiles)
+        filmer = Filmer(
+            run,
+            terrains=("flat", "stairs_fd") if stairs else ("flat",),
+            command=_straight(env.contract),
+            every=task.training.run.video_interval > 0,
+            last=request.film,
+        )
     contract = replace(
         env.contract, provenance={**env.contract.provenance, PHYSICS: _physics(plan, scored=scorer is not None)}
     )
@@ -161,6 +166,12 @@ def _runner(
     )
 
 
+def _straight(contract: PolicyContract) -> tuple[float, float, float] | None:
+    """Return the command that a film of a robot that learned to walk straight ahead shows; None for other robots."""
+    forward, lateral, yaw = contract.command_limits
+    return None if lateral or yaw else (0.75 * forward, 0.0, 0.0)
+
+
 def _physics(plan: TrainPlan, *, scored: bool) -> dict[str, Any]:
     """Return the physics of a run for the provenance of its policies: the engine that trains them, and the one that scores them."""
     environment, known = plan.task.environment, versions()
@@ -169,7 +180,7 @@ def _physics(plan: TrainPlan, *, scored: bool) -> dict[str, Any]:
     low, high = environment.randomization.foot_torsion
     settings |= {**engine.solver_settings(physics), "foot_torsion": f"{low:g} to {high:g} times the model's"}
     learned = {"engine": plan.backend, "version": known.get(plan.backend.partition(":")[0]), "settings": settings}
-    judge = {"engine": "mujoco", "version": known["mujoco"], "settings": {"suite": str(plan.request.score_suite)}}
+    judge = {"engine": "mujoco", "version": known["mujoco"], "settings": {"suite": str(plan.suite)}}
     return {"trained": [learned], "tuned": [judge] if scored else []}
 
 

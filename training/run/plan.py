@@ -61,6 +61,12 @@ class TrainPlan:
     notice: str = ""
     """Sentence to print before the run begins, empty for none."""
 
+    @property
+    def suite(self) -> str | None:
+        """Return the suite that scores checkpoints; None for no scores."""
+        scored = self.request.score and self.task.training.run.gauge_interval > 0
+        return (self.request.score_suite or self.task.suite) if scored else None
+
 
 def prepare(request: TrainRequest) -> TrainPlan:
     """Check a request; nothing is built or written.
@@ -133,6 +139,8 @@ def _checked_plan(request: TrainRequest, task: Task, backend: str) -> TrainPlan:
     device = own_device(request.device, backend)
     if request.capture and not device.startswith("cuda"):
         raise ConfigurationError(f"--capture replays CUDA graphs and the device is '{device}'; leave it out")
+    if request.score:
+        load_suite(request.score_suite or task.suite)
     settings = {"backend": backend, "environment": to_plain(task.environment), "training": to_plain(task.training)}
     known = find_task(request.task)
     foreign = foreign_functions(settings, to_plain([known.environment, known.training]))
@@ -158,9 +166,8 @@ def _of_this_command(request: TrainRequest, run: RunConfiguration) -> RunConfigu
     """Return the run's settings with those changed that belong to this command alone and are not kept."""
     if request.seconds is not None and not any(o.startswith(_GAUGE_WAIT) for o in request.own_overrides()):
         run = replace(run, gauge_wait=0.0)  # the limit holds for the whole command
-    if request.score_suite is None:
+    if not request.score:
         return replace(run, gauge_interval=0)
-    load_suite(request.score_suite)
     return run
 
 

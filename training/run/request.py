@@ -13,8 +13,6 @@ from ...files.choices import PLACE, PLAYED, SCORES, SPAN, WRITTEN, Choice
 
 LOG_ROOT = Path("logs/rsl_rl")
 """Root of the training runs: ``<LOG_ROOT>/<experiment>/<run>/``."""
-QUICK_SUITE = "quick"
-"""Suite of the scores of checkpoints."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,11 +95,16 @@ class TrainRequest:
     video_every: Annotated[
         int | None, Ge(1), Choice("Iterations between two videos, made in a side process. Default: none.", WRITTEN)
     ] = None
+    film: Annotated[
+        bool, Choice("At the end, film the policy: on level ground, and on stairs if the task has some.", WRITTEN)
+    ] = True
     score_every: Annotated[int | None, Ge(1), Choice("Iterations between two scores. Default: the task's.", SCORES)] = (
         None
     )
-    score_suite: str | None = QUICK_SUITE
-    """Suite that scores checkpoints in a side process; None for no scores."""
+    score: Annotated[bool, Choice("Gauge checkpoints in a side process; best.pt is the best of them.", SCORES)] = True
+    score_suite: Annotated[
+        str | None, Choice("Suite of the scores, or a suite's .toml file. Default: the task's.", SCORES, "suites")
+    ] = None
     score_threads: Annotated[
         int | None,
         Ge(1),

@@ -47,7 +47,7 @@ class TrainingRunner(RunState):
 
         Args:
             scorer: gauges the student every ``run.gauge_interval`` iterations.
-            filmer: makes a video every ``run.video_interval`` iterations.
+            filmer: makes videos every ``run.video_interval`` iterations, and at the end.
             progress: called after every iteration.
             parts: arguments of ``RunState``.
 
@@ -96,6 +96,7 @@ class TrainingRunner(RunState):
                 raise
             if reason != "signal":
                 self.scores.submit(written)
+                self.videos.submit(written, last=True)
                 self._wait(self.configuration.run.gauge_wait, lambda: signals.received is not None)
         self.logger.flush()
         code = 128 + signals.received if reason == "signal" and signals.received else 0
@@ -229,7 +230,7 @@ class TrainingRunner(RunState):
 
     def _wait(self, seconds: float, stop: Callable[[], bool]) -> None:
         """Wait for pending scores and videos, at most ``seconds`` [s] each, until ``stop`` returns True."""
-        names = (("gauge", self.scores), ("video", self.videos))
+        names = (("score", self.scores), ("film", self.videos))
         if waiting := [name for name, side in names if side.pending and seconds > 0.0]:
             self.message(f"Waiting for the {' and the '.join(waiting)}.")
         self.scores.take(seconds, stop)

@@ -20,31 +20,28 @@ def check_gpu(request: TrainRequest) -> None:
     """Refuse a new run on an engine made for a GPU where the driver has none; torch is not loaded for it.
 
     Raises:
-        TaskError: unknown task.
+        TaskError: unknown task, or a setting that does not fit.
         DeviceError: no GPU; the advice says what trains here and how long it takes.
     """
-    if request.resume is not None or request.device is not None:
-        return
-    task = find_task(request.task)
+    if (request.resume, request.init_from, request.device) != (None, None, None):
+        return  # a checkpoint is read first
+    task = find_task(request.task, request.own_overrides())
     backend = request.backend or task.backend
     if not made_for_gpu(backend) or gpu_count() > 0:
         return
     cores = cpu_threads(None)
-    slow = _time(task, _CORE_RATE, cores, request)
     raise DeviceError(
         f"task '{task.name}' trains on {backend}, which wants an NVIDIA GPU, and this machine has none",
         f"'gaitgauge train toy' learns to walk here in {_time(_TOY, _TOY_CORE_RATE, cores)}, docs/start/first_training.ipynb "
-        f"trains go2-flat on a hosted GPU, and --backend mujoco trains this task here in {slow}",
+        f"trains go2-flat on a hosted GPU, and --backend mujoco trains this task here in "
+        f"{_time(task, _CORE_RATE, cores)}",
     )
 
 
-def _time(task: Task, rate: float, cores: int, request: TrainRequest | None = None) -> str:
-    """Return about how long a task, with the sizes that a request asks for, takes on some cores, for people."""
+def _time(task: Task, rate: float, cores: int) -> str:
+    """Return about how long a task takes on some cores, for people."""
     run = task.training.run
-    iterations, worlds = run.iterations, task.environment.num_envs
-    if request is not None:
-        iterations, worlds = request.iterations or iterations, request.num_envs or worlds
-    minutes = iterations * run.steps_per_iteration * worlds / (rate * cores) / 60.0
+    minutes = run.iterations * run.steps_per_iteration * task.environment.num_envs / (rate * cores) / 60.0
     if minutes < 90.0:
         return f"about {max(round(minutes), 1)} min"
     return f"about {minutes / 60.0:.0f} h" if minutes < 72 * 60 else f"about {minutes / 1440.0:.0f} days"

@@ -222,7 +222,7 @@ class SweepRun:
             options = ["--score-suite", sweep.training_suite, "--score-threads", str(score_threads)]
         options += [] if seconds is None else ["--time", f"{max(seconds, 1.0):.0f}s"]
         options += [] if self.on_gpu else ["--device", "cpu"]
-        options += ["--log-root", str(self.folder / "logs")]
+        options += ["--no-film", "--log-root", str(self.folder / "logs")]
         if (run := self.directory) is not None:
             # The settings are those of the checkpoint; given again, functions that they name need no --trust.
             return [*CHILD_PROGRAM, "train", self.entry.task, *self.settings, "--resume", str(run), *options]
@@ -337,7 +337,13 @@ def plan_runs(sweep: Sweep, folder: Path, *, to_train: bool = True) -> tuple[lis
         device = entry.device or sweep.device
         init_from = sweep.init_from if entry.init_from is None else entry.init_from
         request = TrainRequest(
-            task=entry.task, overrides=settings, backend=backend, device=device, init_from=init_from, score_suite=None
+            task=entry.task,
+            overrides=settings,
+            backend=backend,
+            device=device,
+            init_from=init_from,
+            score=False,
+            film=False,
         )
         try:
             _check_seeds(sweep.seeds_of(entry), settings)
