@@ -334,6 +334,20 @@ def test_time_limit_waits_for_no_score_unless_asked():
     assert wait("training.run.gauge_wait=30", seconds=60.0) == 30.0
 
 
+@pytest.mark.parametrize(
+    ("choices", "suite"),
+    [
+        ({"task": "toy"}, "toy"),
+        ({"task": "toy", "score_suite": "demo"}, "demo"),
+        ({"task": "toy", "score": False}, None),
+        ({"task": "go2-flat", "backend": "fake"}, None),  # its training is shorter than a score
+        ({"task": "go2-cts", "backend": "fake"}, "quick"),
+    ],
+)
+def test_a_task_has_a_suite_for_its_scores(choices, suite):
+    assert prepare(TrainRequest(**choices)).suite == suite
+
+
 def test_scorer_runs_the_command_line_of_evaluate(tmp_path, monkeypatch):
     from gaitgauge.training.run import side_process
 

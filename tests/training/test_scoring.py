@@ -3,9 +3,12 @@
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from gaitgauge.policy.finding import PRETRAINED
+from gaitgauge.training.run import side_process
+from gaitgauge.training.run.beside import Videos
 from gaitgauge.training.run.filming import Filmer
 from gaitgauge.training.run.scoring import Scorer
 from gaitgauge.training.run.side_process import Job, SideProcess
@@ -77,6 +80,37 @@ def test_a_gauge_that_cannot_play_says_why(tmp_path):
     assert (report.iteration, dict(report.scores)) == (3, {})
     log = tmp_path / "gauge" / "quick" / "model_3.log"
     assert report.failure == f"exit code 2; see {log}" and "model_3.pt" in log.read_text()
+
+
+def test_a_film_of_each_terrain_once(tmp_path, monkeypatch):
+    started = []
+
+    class Ended:
+        def __init__(self, command, **options):
+            started.append(command[command.index("play") :])
+
+        def poll(self):
+            return 0
+
+    monkeypatch.setattr(side_process.subprocess, "Popen", Ended)
+    filmer = Filmer(tmp_path, terrains=("flat", "stairs_fd"), command=(0.75, 0.0, 0.0))
+    for _ in range(2):
+        filmer.submit(tmp_path / "model_5.pt", 5)
+    films = [tmp_path / "videos" / f"model_5_{terrain}.mp4" for terrain in ("flat", "stairs_fd")]
+    assert filmer.take(5.0) == ([(film, 5) for film in films], "")
+    assert [command[3] for command in started] == ["flat", "stairs_fd"]
+    for command, film in zip(started, films, strict=True):
+        assert command[command.index("--out") + 1] == str(film)
+        assert command[command.index("--command") + 1 :] == ["0.75", "0.0", "0.0"]
+
+
+@pytest.mark.parametrize("last", [True, False])
+@pytest.mark.parametrize("wanted", [{"every": True, "last": False}, {"every": False, "last": True}])
+def test_films_at_the_end_or_every_so_often(tmp_path, monkeypatch, last, wanted):
+    filmer, asked = Filmer(tmp_path, terrains=("flat",), **wanted), []
+    monkeypatch.setattr(filmer, "submit", lambda path, iteration: asked.append(iteration))
+    Videos(SimpleNamespace(iteration=7), filmer).submit(tmp_path / "model_7.pt", last=last)
+    assert asked == ([7] if wanted["last" if last else "every"] else [])
 
 
 def test_a_machine_that_cannot_draw_is_told_once(tmp_path, monkeypatch):
