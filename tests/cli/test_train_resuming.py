@@ -144,7 +144,7 @@ def test_what_is_told_to_go_on_with_starts_as_many_processes(run, trained, monke
     def stopped(plan, **_):
         return TrainingOutcome(reason="time", iteration=2, checkpoint=trained / "model_2.pt", exit_code=0), trained
 
-    monkeypatch.setattr("gaitgauge.cli.train.train", stopped)
+    monkeypatch.setattr("gaitgauge.training.run.launch.train", stopped)
     for name, value in told.items():
         monkeypatch.setenv(name, value)
     result = run("train", "go2-flat", *FAKE, *SMALL)
