@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import sys
 import time as clock
 from collections import deque
 from dataclasses import replace
@@ -49,8 +50,13 @@ def run_training(request: TrainRequest, time: str | None) -> None:
     check_gpu(request)  # before torch is loaded
     from ..training.run.launch import train
     from ..training.run.plan import prepare
+    from ..training.starting import processes_to_start, start_processes
 
     plan = prepare(replace(request, seconds=seconds))
+    if (count := processes_to_start(request.gpus, request.device, plan.device)) > 1:
+        if code := start_processes(count, sys.argv[1:]):
+            raise typer.Exit(code)
+        return
     task = request.task
     # Of several processes, one for each GPU, the first prints.
     console = Terminal(quiet=os.environ.get("RANK", "0") != "0", may_lose=True)
@@ -79,17 +85,15 @@ def run_training(request: TrainRequest, time: str | None) -> None:
 
 
 def _start() -> tuple[str, str]:
-    """Return the start of a command with as many processes as this run has, and a note on what the reader must add."""
+    """Return the start of a command on as many machines as this run has, and a note on what the reader must add."""
     from ..training.processes import Processes, told_number
 
     count = Processes.told().count
-    if count == 1:
-        return "gaitgauge", ""
     here = told_number("LOCAL_WORLD_SIZE", count)
-    start = f"--nproc-per-node {here} -m gaitgauge.cli.main"
-    if 0 < here < count:
-        return f"torchrun --nnodes {count // here} {start}", ", on every machine and with its --rdzv options"
-    return f"torchrun {start}", ""
+    if not 0 < here < count:
+        return "gaitgauge", ""
+    start = f"torchrun --nnodes {count // here} --nproc-per-node {here} -m gaitgauge.cli.main"
+    return start, ", on every machine and with its --rdzv options"
 
 
 def _again(plan: TrainPlan) -> list[str]:
@@ -97,7 +101,7 @@ def _again(plan: TrainPlan) -> list[str]:
     run, usual = plan.task.training.run, RunConfiguration()
     found = ["--trust"] if plan.needs_trust else []
     found += ["--logger", run.logger] if run.logger != usual.logger else []
-    for name in ("device", "threads", "capture", "fuse", "film", "score", "score_suite", "score_threads"):
+    for name in ("device", "gpus", "threads", "capture", "fuse", "film", "score", "score_suite", "score_threads"):
         value, option = getattr(plan.request, name), name.replace("_", "-")
         if value == getattr(TrainRequest, name):
             continue

@@ -1,4 +1,4 @@
-"""Join the processes of one run, one for each GPU as torchrun starts them or this one alone, and choose each one's GPU.
+"""Join the processes of one run, one for each GPU as ``starting`` or torchrun starts them, and choose each one's GPU.
 
 CPU tensors travel through gloo, which notices at once that a process is gone; GPU tensors through NCCL, which waits for it instead.
 A process that waits for the GPU therefore asks it again and again, so that signals arrive, and gives up in the end.
@@ -157,15 +157,3 @@ def own_device(asked: str | None, backend: str) -> str:
             f"torchrun started more processes than this machine has GPUs ({gpus}); give --nproc-per-node {gpus}"
         )
     return choose_device(backend, f"cuda:{place}" if asked == "cuda" and gpus > 0 else asked)
-
-
-def idle_gpus(device: str) -> str:
-    """Return a sentence on GPUs that no process of a run uses, empty if there are none."""
-    processes = told_number("LOCAL_WORLD_SIZE", 1)
-    gpus = torch.cuda.device_count() if device.startswith("cuda") else 0
-    if processes >= gpus:
-        return ""
-    return (
-        f"{processes} of {gpus} GPUs {'is' if processes == 1 else 'are'} used; torchrun --nproc-per-node {gpus} uses all, and "
-        "CUDA_VISIBLE_DEVICES says which are meant."
-    )

@@ -23,12 +23,12 @@ from gaitgauge.gauge.result import TerrainScore, read_result
 from gaitgauge.gauge.store import StoreError
 from gaitgauge.training.configuration import ConfigurationError
 from gaitgauge.training.overrides import override_keys
-from gaitgauge.training.processes import idle_gpus
 from gaitgauge.training.run.logger import make_writer
 from gaitgauge.training.run.plan import prepare
 from gaitgauge.training.run.request import TrainRequest
 from gaitgauge.training.run.scoring import Scorer, scores_of
 from gaitgauge.training.run.side_process import PROGRAM
+from gaitgauge.training.starting import processes_to_start
 from gaitgauge.training.tasks import TASKS
 from small_run import FAKE, SMALL
 
@@ -257,14 +257,40 @@ def test_a_run_in_which_nothing_was_written_leaves_no_directory(refused, tmp_pat
     assert list((tmp_path / "logs" / "rsl_rl" / "go2_flat").iterdir()) == []
 
 
-def test_idle_gpus_are_named(monkeypatch):
+@pytest.mark.parametrize(
+    ("asked", "device", "given", "count"),
+    [
+        (None, None, "cuda:0", 4),
+        (None, "cuda", "cuda:0", 4),
+        (2, None, "cuda:0", 2),
+        (None, "cuda:1", "cuda:1", 1),
+        (None, None, "cpu", 1),
+    ],
+)
+def test_a_training_uses_all_gpus_unless_it_is_told(monkeypatch, asked, device, given, count):
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 4)
-    assert idle_gpus("cuda:0").startswith("1 of 4 GPUs is used; torchrun --nproc-per-node 4 uses all")
-    assert idle_gpus("cpu") == ""
-    monkeypatch.setenv("LOCAL_WORLD_SIZE", "3")
-    assert idle_gpus("cuda:0").startswith("3 of 4 GPUs are used; torchrun --nproc-per-node 4 uses all")
-    monkeypatch.setenv("LOCAL_WORLD_SIZE", "4")
-    assert idle_gpus("cuda:0") == ""
+    assert processes_to_start(asked, device, given) == count
+    monkeypatch.setenv("WORLD_SIZE", "4")
+    assert processes_to_start(asked, device, given) == 1
+
+
+def test_more_gpus_than_there_are(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    with pytest.raises(
+        ConfigurationError, match=r"--gpus is 3, but this command has 2 GPUs; give --gpus 2 or leave it out"
+    ):
+        processes_to_start(3, None, "cuda:0")
+    with pytest.raises(ConfigurationError, match=r"--gpus is 2, but this command trains on 'cuda:1' alone"):
+        processes_to_start(2, "cuda:1", "cuda:1")
+
+
+def test_several_gpus_get_the_command_as_it_was_typed(run, monkeypatch):
+    started = []
+    monkeypatch.setattr("gaitgauge.training.starting.processes_to_start", lambda *_: 3)
+    monkeypatch.setattr("gaitgauge.training.starting.start_processes", lambda *given: started.append(given) or 5)
+    monkeypatch.setattr(sys, "argv", ["gaitgauge", "train", "go2-flat"])
+    assert run("train", "go2-flat", *FAKE, *SMALL).exit_code == 5
+    assert started == [(3, ["train", "go2-flat"])]
 
 
 def test_more_processes_than_gpus(monkeypatch):

@@ -132,7 +132,7 @@ def test_what_is_told_to_go_on_with_keeps_what_checkpoints_do_not(run, monkeypat
     ("told", "expected"),
     [
         ({}, "go on with: gaitgauge train"),
-        ({"WORLD_SIZE": "2"}, "go on with: torchrun --nproc-per-node 2 -m gaitgauge.cli.main train"),
+        ({"WORLD_SIZE": "2"}, "go on with: gaitgauge train"),
         (
             {"WORLD_SIZE": "16", "LOCAL_WORLD_SIZE": "8"},
             "go on with, on every machine and with its --rdzv options: "

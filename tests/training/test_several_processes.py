@@ -1,4 +1,4 @@
-"""Training in two processes, as torchrun starts them on one machine and on two; on the CPU."""
+"""Training in two processes, as ``train`` starts them on one machine and torchrun on two; on the CPU."""
 
 import json
 import os
@@ -22,8 +22,9 @@ SMALL = (
     "training.network.teacher_hidden=8",
     "training.network.student_hidden=8",
 )
+MODULE = ("-m", "gaitgauge.cli.main")
 TRAIN = (
-    *("-m", "gaitgauge.cli.main", "train", "go2-flat", "--backend", "fake", "--device", "cpu", "--num-envs", "8"),
+    *("train", "go2-flat", "--backend", "fake", "--device", "cpu", "--num-envs", "8"),
     *("--no-score", "--no-film", "--seed", "5", *SMALL),
 )
 SCRIPT = """
@@ -49,10 +50,14 @@ runner.processes.leave()
 """
 
 
-def start(
-    folder: Path, *command: str, torchrun: tuple[str, ...] = ("--standalone", "--nproc-per-node", "2")
-) -> subprocess.Popen[str]:
-    launcher = [sys.executable, "-m", "torch.distributed.run", *torchrun, *command]
+TWO = "import sys; from gaitgauge.training.starting import start_processes; sys.exit(start_processes(2, sys.argv[1:]))"
+"""Start a command as ``train`` does where there are two GPUs."""
+ONE_MACHINE = ("--standalone", "--nproc-per-node", "2")
+
+
+def start(folder: Path, *command: str, torchrun: tuple[str, ...] = ()) -> subprocess.Popen[str]:
+    with_torchrun = [sys.executable, "-m", "torch.distributed.run", *torchrun, *command]
+    launcher = with_torchrun if torchrun else [sys.executable, "-c", TWO, *command]
     environment = {
         **os.environ,
         "OMP_NUM_THREADS": "1",
@@ -66,7 +71,7 @@ def start(
 @pytest.mark.slow
 def test_gradients_are_averaged(tmp_path):
     (tmp_path / "learn.py").write_text(SCRIPT)
-    process = start(tmp_path, "learn.py")
+    process = start(tmp_path, "learn.py", torchrun=ONE_MACHINE)
     output, _ = process.communicate(timeout=300)
     assert process.returncode == 0, output
 
@@ -153,7 +158,7 @@ def test_gradients_are_averaged_over_two_nodes(tmp_path):
 
 @pytest.mark.slow
 def test_a_run_on_two_nodes_is_one_run_and_goes_on_without_one_of_them(tmp_path):
-    nodes = start_nodes(tmp_path, *TRAIN, "--iterations", "1000000")
+    nodes = start_nodes(tmp_path, *MODULE, *TRAIN, "--iterations", "1000000")
     deadline = time.monotonic() + 200.0
     while not list(tmp_path.rglob("model_2.rank1.pt")) and time.monotonic() < deadline:
         time.sleep(0.1)
@@ -169,7 +174,7 @@ def test_a_run_on_two_nodes_is_one_run_and_goes_on_without_one_of_them(tmp_path)
     last = description["iteration"]
     assert last >= 2 and (run / f"model_{last}.pt").is_file()
     assert "--resume" in output
-    alone = [sys.executable, *TRAIN, "--resume", "latest", "--iterations", str(last + 1)]
+    alone = [sys.executable, *MODULE, *TRAIN, "--resume", "latest", "--iterations", str(last + 1)]
     done = subprocess.run(alone, cwd=tmp_path, env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}, timeout=300)
     assert done.returncode == 0
     assert (run / f"model_{last + 1}.pt").is_file()

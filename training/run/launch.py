@@ -23,7 +23,7 @@ from ...policy.finding import shipped_policies
 from ..algorithms.symmetry import build_mirror
 from ..configuration import ConfigurationError
 from ..environment.environment import TrainingEnvironment
-from ..processes import Processes, ProcessLostError, idle_gpus
+from ..processes import Processes, ProcessLostError
 from .checkpoint import CheckpointError
 from .filming import Filmer
 from .plan import TrainPlan
@@ -101,8 +101,8 @@ def _open_run(
     run = plan.run or new_run_directory(plan.request.log_root, settings.experiment, settings.run_name)
     closing.callback(_remove_unused, run)
     started(run)
-    for sentence in filter(None, (plan.notice, idle_gpus(plan.device))):
-        message(sentence)
+    if plan.notice:
+        message(plan.notice)
     closing.callback(lock_folder(run, CheckpointError).release)
     return run
 

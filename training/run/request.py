@@ -35,6 +35,9 @@ class TrainRequest:
     device: Annotated[str | None, Choice("cpu, cuda or cuda:N; the default is what the engine is made for.", PLACE)] = (
         None
     )
+    gpus: Annotated[
+        int | None, Ge(1), Choice("GPUs that train this policy together. Default: all, or one with cuda:N.", PLACE)
+    ] = None
     num_envs: Annotated[int | None, Ge(1), Choice("Parallel worlds, for each GPU. Default: the task's.", PLACE)] = None
     robot: Annotated[
         str | None,

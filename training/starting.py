@@ -1,0 +1,79 @@
+"""Start the processes of a training on this machine, one for each GPU."""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+import tempfile
+import uuid
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from torch.distributed.elastic.multiprocessing import DefaultLogsSpecs, SignalException, Std
+from torch.distributed.elastic.multiprocessing.errors import ChildFailedError
+from torch.distributed.launcher.api import LaunchConfig, elastic_launch
+
+from .configuration import ConfigurationError
+
+
+def processes_to_start(gpus: int | None, asked: str | None, device: str) -> int:
+    """Return how many processes a training is to start, one for each GPU; 1 if this process trains itself.
+
+    Args:
+        gpus: how many GPUs the user asks for, None for all that are visible.
+        asked: the device that the user asks for; one GPU by number (``cuda:1``) is that GPU alone.
+        device: what ``own_device`` made of it.
+
+    Raises:
+        ConfigurationError: there are not so many.
+    """
+    if "WORLD_SIZE" in os.environ:  # torchrun or this function's caller started this process
+        return 1
+    one = not device.startswith("cuda") or asked not in (None, "cuda")
+    here = 1 if one else torch.cuda.device_count()
+    if gpus is not None and gpus > here:
+        has = f"trains on '{device}' alone" if one else f"has {here} GPU{'s' * (here > 1)}"
+        raise ConfigurationError(f"--gpus is {gpus}, but this command {has}; give --gpus {here} or leave it out")
+    return gpus or here
+
+
+def start_processes(count: int, arguments: Sequence[str]) -> int:
+    """Run this program in several processes that know of each other, and wait for their end.
+
+    The first process writes to the terminal. What others printed is shown where they failed first or the first one was killed.
+
+    Args:
+        count: of processes.
+        arguments: of the program.
+
+    Returns:
+        The exit code of the first process that failed, otherwise 0.
+    """
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    logging.getLogger("torch.distributed.elastic").setLevel(logging.CRITICAL)
+    with tempfile.TemporaryDirectory() as folder:
+        logs = DefaultLogsSpecs(log_dir=folder, redirects=dict.fromkeys(range(1, count), Std.ALL))
+        config = LaunchConfig(
+            min_nodes=1,
+            max_nodes=1,
+            nproc_per_node=count,
+            run_id=uuid.uuid4().hex,
+            rdzv_backend="c10d",
+            rdzv_endpoint="localhost:0",
+            max_restarts=0,
+            logs_specs=logs,
+        )
+        try:
+            elastic_launch(config, sys.executable)("-m", "gaitgauge.cli.main", *arguments)
+        except ChildFailedError as error:
+            rank, failure = error.get_first_failure()
+            killed = failure.exitcode < 0
+            tellers = [rank] if rank else range(1, count) if killed else []
+            texts = [p.read_text(errors="replace") for r in tellers for p in Path(folder).rglob(f"{r}/stderr.log")]
+            sys.stderr.write("".join(dict.fromkeys(texts)))
+            return 128 - failure.exitcode if killed else failure.exitcode
+        except SignalException as error:
+            return 128 + error.sigval
+    return 0
