@@ -24,9 +24,11 @@ from ..policy.contract import PolicyContract
 from ..policy.foreign.adapters import AT_ONCE, doubt
 from ..studies.naming import free_run_folder, run_folders
 from .console import Terminal, make_table, print_json
-from .progress import ProgressDisplay, duration
+from .progress import ProgressDisplay
 from .studies import resumable
 
+FILM_SECONDS, REPORT_SECONDS = 10.0, 1.0
+"""Time of the film and of results with their page on one core that does nothing else [s]."""
 SLOWER = (
     "the suite commands more than the policy was made for; 'gaitgauge play POLICY' stays within its limits, and a suite with "
     'commands.beyond = "clip" plays it there'
@@ -45,18 +47,13 @@ def run_evaluation(request: Request, *, out: Path | None, resume: bool, clip: bo
     quiet = redirect_stdout(io.StringIO() if request.cluster else sys.stdout)
     with resumable(console, "gauging", folder, "--resume") as display, quiet:
         command = ["gaitgauge", *sys.argv[1:]]
-        result = evaluate(prepared, folder, resume=resume, command=command, watch=shower(display))
-    report = write_report(folder)
-    if clip:
-        from .clip import make_clip
-
-        options = [request.policy, "--suite", request.suite] + ["--trust"] * request.trust
-        options += ["--robot", request.robot] if request.robot else []
-        options += ["--contract", request.contract] if request.contract else []
-        if sentence := make_clip(folder, result, options):
-            console.say(sentence)
-        else:
-            report = write_report(folder)
+        result = evaluate(prepared, folder, resume=resume, command=command, watch=shower(display, film=clip))
+        report = write_report(folder)
+        sentence = _film(display, folder, request, result) if clip else None
+    if sentence:
+        console.say(sentence)
+    elif clip:
+        report = write_report(folder)
     if json_output:
         print_json(result.to_data())
         return
@@ -66,6 +63,17 @@ def run_evaluation(request: Request, *, out: Path | None, resume: bool, clip: bo
     if sentence := doubtful_assumptions(prepared.policy.contract, prepared.suite, folder, within=within):
         console.say(sentence)
     console.say(f"results  {folder / 'results.json'}\nepisodes {folder / 'episodes.csv'}\nreport   {report}")
+
+
+def _film(display: ProgressDisplay, folder: Path, request: Request, result: Result) -> str | None:
+    """Film the robot for the report; return why there is no film."""
+    from .clip import make_clip
+
+    options = [request.policy, "--suite", request.suite] + ["--trust"] * request.trust
+    options += ["--robot", request.robot] if request.robot else []
+    options += ["--contract", request.contract] if request.contract else []
+    display.update(1.0, "filming the robot", left=display.left)
+    return make_clip(folder, result, options)
 
 
 def doubtful_assumptions(contract: PolicyContract, suite: Suite, folder: Path, *, within: bool = True) -> str | None:
@@ -81,17 +89,18 @@ def doubtful_assumptions(contract: PolicyContract, suite: Suite, folder: Path, *
     return f"the robot fell at once in {sum(fell)} of {len(fell)} episodes: {advice}"
 
 
-def shower(display: ProgressDisplay) -> Callable[[Status], None]:
-    """Return the function that shows the progress of an evaluation."""
+def shower(display: ProgressDisplay, *, film: bool = False) -> Callable[[Status], None]:
+    """Return the function that shows the progress of an evaluation; ``film``: one is made afterwards."""
 
     def show(status: Status) -> None:
-        seconds = status.seconds_left
-        left = "estimating time" if seconds is None else f"about {duration(seconds)} left"
+        left = status.seconds_left
+        if left is not None:
+            left += (REPORT_SECONDS + FILM_SECONDS * film) * max(status.slowness, 1.0)
         places = sorted({f"{e.terrain} L{e.level}" if e.level else e.terrain for e in status.active})
         running = ", ".join(places[:5]) + (f" and {len(places) - 5} more" if len(places) > 5 else "")
-        display.update(
-            1.0 - status.remaining_work, f"{status.done} of about {status.expected} episodes, {left}", {"now:": running}
-        )
+        text = f"{status.done} of about {status.expected} episodes"
+        text += ", estimating time" * (status.seconds_left is None)
+        display.update(1.0 - status.remaining_work, text, {"now:": running}, left=left)
 
     return show
 

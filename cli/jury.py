@@ -18,7 +18,7 @@ from ..studies.jury.verdict import OFF, command_words
 from ..studies.naming import free_run_folder, joined_names
 from .console import Terminal, make_table, print_json
 from .policies import policy_files
-from .progress import ProgressDisplay, duration
+from .progress import ProgressDisplay
 from .studies import resumable
 
 
@@ -50,9 +50,9 @@ def run_jury(request: JuryRequest, engines: str, *, out: Path | None, resume: bo
 
 
 def _show(display: ProgressDisplay, status: JuryStatus) -> None:
-    left = "estimating time" if status.seconds_left is None else f"about {duration(status.seconds_left)} left"
-    text = f"engine {status.number} of {status.count}, {status.engine}: {left}"
-    display.update(status.share, text, {"policy": status.policy})
+    text = f"engine {status.number} of {status.count}, {status.engine}"
+    text += ": measuring its speed" * (status.seconds_left is None)
+    display.update(status.share, text, {"policy": status.policy}, left=status.seconds_left)
 
 
 def print_jury(console: Terminal, results: Mapping[str, Any]) -> None:

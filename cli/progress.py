@@ -1,12 +1,13 @@
-"""Show progress: a block with a bar on a terminal, a plain line now and then elsewhere."""
+"""Show progress: a block with a bar on a terminal, a plain line now and then elsewhere. Neither is ever silent for ten seconds."""
 
 from __future__ import annotations
 
+import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
-from rich.console import Group
+from rich.console import Group, RenderableType
 from rich.live import Live
 from rich.progress_bar import ProgressBar
 from rich.table import Table
@@ -14,56 +15,107 @@ from rich.text import Text
 
 from .console import Terminal, printable
 
-_REFRESH = 0.25
-"""Shortest time between two updates of the block [s]."""
-_LOG_EVERY = 10.0
+_LOG_EVERY = 8.0
 """Time between two lines where there is no terminal [s]."""
+_TICK = 0.5
+"""Time after which it is looked whether a line is due [s]."""
 _COLUMNS = 4
 """Details side by side."""
+_LEAST = 1.0
+"""Time that is shown where the estimate has run out [s]."""
 
 
 class ProgressDisplay:
-    """Show the progress of a ``with`` block; nothing is shown before the first ``update``."""
+    """Show the progress of a ``with`` block; between two updates the remaining time counts down."""
 
-    def __init__(self, console: Terminal, title: str) -> None:
-        self._console = console
-        self._title = title
-        self._began = self._last = time.monotonic()
+    def __init__(self, console: Terminal, title: str, *, clock: Callable[[], float] = time.monotonic) -> None:
+        """Prepare the display; ``clock`` gives the time [s]."""
+        self._console, self._title, self._clock = console, title, clock
+        self._began = self._told = self._updated = clock()
+        self._share, self._text = 0.0, "starting"
+        self._left: float | None = None
+        self._details: Mapping[str, str] = {}
         self._live: Live | None = None
+        self._lock, self._stop = threading.Lock(), threading.Event()
+        self._lines = threading.Thread(target=self._tell_now_and_then, daemon=True)
 
     def __enter__(self) -> ProgressDisplay:
         if self._console.is_terminal:
-            self._last = float("-inf")
-            self._live = Live(console=self._console, refresh_per_second=4)
+            self._live = Live(console=self._console, refresh_per_second=4, get_renderable=self._block)
             self._live.__enter__()
+        else:
+            self._lines.start()
         return self
 
     def __exit__(self, *details: Any) -> None:
+        self._stop.set()
         if self._live is not None:
             self._live.__exit__(*details)
+        else:
+            self._lines.join()
 
-    def update(self, share: float, text: str, details: Mapping[str, str] | None = None, *, last: bool = False) -> None:
-        """Show the progress, if the last update was long enough ago.
+    def update(
+        self,
+        share: float,
+        text: str,
+        details: Mapping[str, str] | None = None,
+        *,
+        left: float | None = None,
+        last: bool = False,
+    ) -> None:
+        """Say how far the work is.
 
         Args:
             share: of the work that is done, 0 to 1.
-            last: show it in any case.
+            left: estimated time until the work ends [s]; None where there is no estimate.
+            last: print a line in any case where there is no terminal.
         """
-        now = time.monotonic()
-        if now - self._last < (_REFRESH if self._live else _LOG_EVERY) and not last:
-            return
-        self._last = now
-        values = {name: printable(value) for name, value in (details or {}).items()}
+        with self._lock:
+            self._share, self._text, self._details = share, text, details or {}
+            self._left, self._updated = left, self._clock()
         if self._live is None:
-            more = "".join(f", {name} {value}" for name, value in values.items())
-            self._console.say(f"{duration(now - self._began)}: {self._title}, {text}{more}")
-            return
-        grid = Table.grid(padding=(0, 2))
-        cells = [Text.assemble((f"{name} ", "dim"), value) for name, value in values.items()]
-        for i in range(0, len(cells), _COLUMNS):
-            grid.add_row(*cells[i : i + _COLUMNS])
-        head = Text.assemble((printable(self._title), "bold"), f"  {printable(text)}")
-        self._live.update(Group(head, ProgressBar(total=1.0, completed=share, width=60), grid))
+            self._tell(last=last)
+
+    def _tell(self, *, last: bool = False) -> None:
+        """Print a line, if the last one was long enough ago, or if it is the ``last`` one."""
+        with self._lock:
+            now = self._clock()
+            if now - self._told < _LOG_EVERY and not last:
+                return
+            self._told = now
+            more = "".join(f", {name} {printable(value)}" for name, value in self._details.items())
+            line = f"{duration(now - self._began)}: {self._title}, {self._words(now)}{more}"
+        self._console.say(line)
+
+    @property
+    def left(self) -> float | None:
+        """Return the time that is shown as left [s]; None where there is no estimate."""
+        with self._lock:
+            return None if self._left is None else self._left_at(self._clock())
+
+    def _tell_now_and_then(self) -> None:
+        while not self._stop.wait(_TICK):
+            self._tell()
+
+    def _words(self, now: float) -> str:
+        """Return the text with the remaining time."""
+        if self._left is None:
+            return self._text
+        return f"{self._text}, about {duration(max(self._left_at(now), _LEAST))} left"
+
+    def _left_at(self, now: float) -> float:
+        return 0.0 if self._left is None else self._left - (now - self._updated)
+
+    def _block(self) -> RenderableType:
+        with self._lock:
+            grid = Table.grid(padding=(0, 2))
+            cells = [Text.assemble((f"{name} ", "dim"), printable(value)) for name, value in self._details.items()]
+            for i in range(0, len(cells), _COLUMNS):
+                grid.add_row(*cells[i : i + _COLUMNS])
+            now = self._clock()
+            words = f"  {duration(now - self._began)}: {printable(self._words(now))}"
+            head = Text.assemble((printable(self._title), "bold"), words)
+            return Group(head, ProgressBar(total=1.0, completed=self._share, width=60), grid)
 
 
 def duration(seconds: float) -> str:

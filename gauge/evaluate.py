@@ -38,8 +38,9 @@ from .motors import parameters_digest, suite_parameters, with_parameters
 from .pipelines import PIPELINES, Environment, check_friction, check_payload, make_environments
 from .plan import Plan, PlanRules, environment_result, plan
 from .play.cluster import Cluster, ClusterError, ClusterWorkers, check_address
-from .play.dispatcher import Dispatcher, Speculation, play
-from .play.progress import ProgressMeter, Status
+from .play.dispatcher import Speculation, play
+from .play.progress import ProgressMeter, Status, watcher
+from .play.remaining import CPU_COST, GPU_COST
 from .play.segments import count_segments
 from .play.workers import Job, local_workers, start_workers
 from .request import Request
@@ -59,8 +60,6 @@ GPU_SPECULATION = Speculation(at_work=_GPU_WORLDS, test_probability=0.02, qualit
 of control steps in a row dominates the run time, and at the end most worlds have nothing to do."""
 _EARLY = 16
 """Episodes of a worker on the CPU up to which it plays others speculatively: more of them slow those that are required."""
-_WATCH_INTERVAL = 0.2
-"""Shortest time between two calls of ``watch`` [s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -238,7 +237,8 @@ def evaluate(
     if torch.device(prepared.device).type == "cpu":
         torch.set_num_threads(1)  # several would change the last bits of the policy's output
     planners = [partial(plan, environment, rules=rules) for environment in prepared.environments]
-    on_progress = _watcher(prepared, watch, began)
+    expected = GPU_COST if torch.device(prepared.device).type == "cuda" else CPU_COST
+    on_progress = watch and watcher(ProgressMeter(suite, began, expected), watch)
     with ExitStack() as stack:
         cluster = None if request.cluster is None else stack.enter_context(closing(Cluster(request.cluster)))
         store = stack.enter_context(RunFolder(folder, identity(prepared), resume=resume))
@@ -317,22 +317,3 @@ def _workers(prepared: Prepared, plans: Sequence[Plan], cluster: Cluster | None)
         threads=1 if cluster is not None else max(threads // count, 1),
     )
     return job, count, speculation
-
-
-def _watcher(
-    prepared: Prepared, watch: Callable[[Status], None] | None, began: float
-) -> Callable[[Dispatcher], None] | None:
-    """Return the function that tells ``watch`` now and then how far playing is."""
-    if watch is None:
-        return None
-    meter = ProgressMeter(prepared.suite, began)
-    next_time = began
-
-    def on_progress(dispatcher: Dispatcher) -> None:
-        nonlocal next_time
-        if time.perf_counter() < next_time:
-            return
-        watch(meter.look(dispatcher.plans, dispatcher.active()))
-        next_time = time.perf_counter() + _WATCH_INTERVAL
-
-    return on_progress

@@ -14,7 +14,8 @@ from dataclasses import dataclass, replace
 
 from ..episodes import Episode, Record
 from ..plan import Plan, Records
-from .segments import count_segments
+from .remaining import Work
+from .segments import AtWork, count_segments
 from .workers import Drop, Failed, Finished, Lost, Play, Progress, Stop, Transport
 
 Planner = Callable[[Records], Plan]
@@ -136,9 +137,35 @@ class Dispatcher:
         self._room[worker] = self._sent[worker] = 0
         self._worker_of = {episode: other for episode, other in self._worker_of.items() if other != worker}
 
-    def active(self) -> dict[Episode, int]:
-        """Return the episodes at work, and the control steps played of each."""
-        return {episode: age for progress in self._progress for episode, age in progress.active.items()}
+    @property
+    def records(self) -> Records:
+        """Return the episodes that have ended, counted or not."""
+        return self._records
+
+    @property
+    def workers(self) -> int:
+        """Return the number of workers that are there, at least 1."""
+        return max(sum(not progress.stopped for progress in self._progress), 1)
+
+    @property
+    def worlds(self) -> int:
+        """Return the number of worlds of each worker."""
+        return self._workers.worlds
+
+    def active(self) -> dict[Episode, AtWork]:
+        """Return the episodes at work, and how far each is."""
+        return {episode: found for progress in self._progress for episode, found in progress.active.items()}
+
+    @property
+    def busy_seconds(self) -> float:
+        """Return the time in the control loop so far, added up over workers [s]."""
+        return sum(progress.busy_seconds for progress in (*self._progress, *self._lost))
+
+    @property
+    def work(self) -> Work:
+        """Return the control steps so far, added up over workers."""
+        all_work = [progress.work for progress in (*self._progress, *self._lost)]
+        return Work(loops=sum(w.loops for w in all_work), world_steps=sum(w.world_steps for w in all_work))
 
     @property
     def physics_steps(self) -> int:

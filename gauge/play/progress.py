@@ -1,26 +1,39 @@
 """Progress of an evaluation: episodes that have ended, and how long the rest will take, for the progress display.
 
-Work is counted in control steps that an episode usually takes: a quality episode walks for minutes, a level test for seconds, and
-those of quality come last.
+Three things decide how long the rest takes, and all are counted in control steps: the work of all worlds, the longest chain of
+episodes that wait for each other (a level's test comes before the next one, quality last), and the work of one worker alone.
+``remaining.Pace`` turns them into time. What episodes usually take is learned from those that have ended.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple, Protocol
 
-from ..episodes import Episode
-from ..goals import count_sub_commands
+from ..episodes import Episode, Record
+from ..goals import TARGET, count_sub_commands
 from ..plan import Plan
+from ..result import FLAT
 from ..suite import Suite
+from .remaining import CPU_COST, Cost, Pace, Work
+from .segments import AtWork
 
-_ENOUGH = 0.02
-"""Share of the work from which on the time that is left is estimated."""
-_SOONEST = 5.0
-"""Time before which it is not [s]: workers start, and what is short ends first."""
-_ALMOST = 0.95
-"""Largest share of an episode that counts as done while it runs."""
+_WATCH_INTERVAL = 0.2
+"""Shortest time between two calls of ``watch`` [s]."""
+_SEARCHES = {"bisection": (4.3, 3.0, 1.0), "curve": (5.2, 3.8, 1.9), "area": (2.0, 4.8, 1.95)}
+"""Of a usual search: rounds of tests, one after another; tests over search seeds; levels at which quality is evaluated."""
+_FORMER = 2.0
+"""Weight of what was expected, in episodes or searches."""
+_EASY = 8.0
+"""The same for level tests: the first ones are of easy levels and short, those at the end of a search take longer."""
+_AGAIN = 1.2
+"""Length of a quality episode over the usual one where a penetration begins a goal again."""
+_UNEVEN = 1.1
+"""Time of a search over that of its tests played without a wait."""
+_OVERTIME = 0.3
+"""Share of the time up to its limit that an episode is expected to take on beyond its usual length."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,59 +50,247 @@ class Status:
     """Time since the evaluation began, or was gone on with [s]."""
     seconds_left: float | None
     """Estimated time until its end [s]; None while too little has been done to say."""
+    slowness: float = 1.0
+    """Time that control steps take over the time that they are expected to take."""
     remaining_work: float
-    """Estimated share of the work that is left, 0 to 1."""
+    """Estimated share of the time that is left, 0 to 1."""
+
+
+class Playing(Protocol):
+    """What the meter reads: ``Dispatcher`` has it."""
+
+    plans: list[Plan]
+
+    @property
+    def records(self) -> Mapping[Episode, Record]:
+        """Return the episodes that have ended."""
+
+    @property
+    def workers(self) -> int:
+        """Return the number of workers."""
+
+    @property
+    def worlds(self) -> int:
+        """Return the worlds of each."""
+
+    @property
+    def busy_seconds(self) -> float:
+        """Return the time of all workers in their control loops [s]."""
+
+    @property
+    def work(self) -> Work:
+        """Return the control steps of all workers."""
+
+    def active(self) -> dict[Episode, AtWork]:
+        """Return the episodes at work."""
+
+
+class Length(NamedTuple):
+    """Usual length of an episode in control steps."""
+
+    parts: int
+    """Segments, which are played side by side."""
+    steps: float
+    """Of one of them."""
+    longest: float
+    """Of the longest of them."""
+    limit: float
+    """That none of them exceeds."""
+
+
+class Lengths:
+    """What episodes usually take: from the suite at first, then from those that have ended on the same terrain, and on others."""
+
+    def __init__(self, suite: Suite) -> None:
+        self._suite, self._known = suite, dict[tuple[str, ...], Length]()
+        self.seen: set[Episode] = set()
+        self._ratios: dict[tuple[str, str | None], tuple[float, int]] = {}
+
+    def see(self, records: Mapping[Episode, Record]) -> None:
+        """Learn from the episodes that have ended, each once."""
+        for episode, record in records.items():
+            if episode not in self.seen:
+                self.seen.add(episode)
+                self.learn(episode, record.control_steps)
+
+    def learn(self, episode: Episode, steps: float) -> None:
+        """Learn from one that took so many control steps."""
+        ratio = steps / self.usual(episode)
+        for key in ((episode.stage, None), (episode.stage, episode.terrain)):
+            total, count = self._ratios.get(key, (0.0, 0))
+            self._ratios[key] = (total + ratio, count + 1)
+
+    def usual(self, episode: Episode) -> float:
+        """Return the control steps of an episode by the suite alone, added up over its segments."""
+        length = self._length(episode.goals)
+        return length.parts * length.steps
+
+    def of(self, episode: Episode) -> Length:
+        """Return the length to expect."""
+        length = self._length(episode.goals)
+        begins_again = (
+            episode.stage == "eval" and self._suite.events.penetration is not None and episode.terrain != FLAT
+        )
+        ratio = _AGAIN if begins_again else 1.0
+        weight = _EASY if episode.stage == "search" else _FORMER
+        for key in ((episode.stage, None), (episode.stage, episode.terrain)):
+            total, count = self._ratios.get(key, (0.0, 0))
+            ratio = (weight * ratio + total) / (weight + count)
+        return length._replace(steps=ratio * length.steps, longest=ratio * length.longest)
+
+    def _length(self, goals: tuple[str, ...]) -> Length:
+        if goals not in self._known:
+            suite, period = self._suite, self._suite.physics.control_period
+            slowest = max(suite.commands.target_time.values(), default=25.0)
+            crossing = 0.4 * slowest  # a target is reached, or missed, in part of the time that it may take
+            mine = [g for g in suite.goals if g.name in goals]
+            times = [
+                sum([p.seconds for p in g.sub_commands[part]] if g.sub_commands else g.phases or (crossing,))
+                + suite.settling.shortest
+                for g in mine
+                for part in range(count_sub_commands(suite, g.name))
+            ]
+            limit = slowest if TARGET in goals else max(times, default=0.0)
+            steps = [t / period for t in times] or [1.0]
+            self._known[goals] = Length(
+                parts=len(steps),
+                steps=sum(steps) / len(steps),
+                longest=max(steps),
+                limit=(limit + suite.settling.longest) / period,
+            )
+        return self._known[goals]
 
 
 class ProgressMeter:
-    """Estimates what is left from plans and from the episodes at work."""
+    """Estimates what is left from plans, from the episodes at work, and from those that have ended."""
 
-    def __init__(self, suite: Suite, began: float) -> None:
-        """Begin; ``began``: value of ``time.perf_counter()`` when the evaluation began."""
-        # a target is reached, or missed, in part of the time that it may take
-        crossing = 0.4 * max(suite.commands.target_time.values(), default=25.0)
-        settling = suite.settling.shortest
-        self._goal_steps = {
-            g.name: sum(
-                sum([p.seconds for p in g.sub_commands[part]] if g.sub_commands else g.phases or (crossing,)) + settling
-                for part in range(count_sub_commands(suite, g.name))
-            )
-            / suite.physics.control_period
-            for g in suite.goals
-        }
-        self._began = began
-        self._open: set[Episode] = set()  # those that had not ended at some look: of an earlier run they are not
-
-    def usual_steps(self, episode: Episode) -> float:
-        """Return the control steps that an episode usually takes."""
-        return sum(self._goal_steps[goal] for goal in episode.goals)
-
-    def look(self, plans: Sequence[Plan], active: Mapping[Episode, int], now: float | None = None) -> Status:
-        """Return the progress of the evaluation.
+    def __init__(self, suite: Suite, began: float, expected: Cost = CPU_COST, lengths: Lengths | None = None) -> None:
+        """Begin.
 
         Args:
-            plans: of all environments.
-            active: episodes at work, and the control steps that each has taken.
-            now: value of ``time.perf_counter()``; None for the present one.
+            began: value of ``time.perf_counter()`` when the evaluation began.
+            expected: cost of control steps before any were seen.
+            lengths: of episodes, where others were played before.
         """
-        required = {episode for found in plans for episode in found.required}
-        ended = [e for found in plans for e in found.counted if e not in required]
-        possible = {e: probability for found in plans for e, probability in found.possible.items()}
-        done = sum(map(self.usual_steps, ended))
-        left = sum(map(self.usual_steps, required))
-        left += sum(probability * self.usual_steps(e) for e, probability in possible.items())
-        total = done + left
-        under_way = sum(min(age, _ALMOST * self.usual_steps(e)) for e, age in active.items() if e in required)
-        left = max(left - under_way, 0.0)
-        # what an earlier run has done took none of this one's time, even where it counts only since a search has asked for it
-        own = under_way + sum(self.usual_steps(e) for e in ended if e in self._open)
-        self._open.update(required, possible)
+        self.lengths = lengths or Lengths(suite)
+        self.pace = Pace(expected)
+        self._suite, self._began = suite, began
+        rounds, tests, self._levels = _SEARCHES[suite.scoring.level]
+        self._search = rounds, tests * len(suite.matrix.search_seeds)
+
+    def look(self, playing: Playing, now: float | None = None) -> Status:
+        """Return the progress of the evaluation; ``now``: value of ``time.perf_counter()``, None for the present one."""
+        plans, active = playing.plans, playing.active()
+        self.lengths.see(playing.records)
+        self.pace.see(playing.busy_seconds, playing.work)
+        done = sum(len(found.counted) - len(found.required) for found in plans)
+        work, more = self.left(plans, active, playing.workers, playing.worlds)
         seconds = (time.perf_counter() if now is None else now) - self._began
+        left = self.pace.seconds(work)
+        if not playing.work.loops:
+            left = max(left + self.pace.cost.start - seconds, 0.0)
+        known = self.pace.known or not any(found.required for found in plans)
         return Status(
-            done=len(ended),
-            expected=round(len(ended) + len(required) + sum(possible.values())),
+            done=done,
+            expected=round(done + sum(len(found.required) for found in plans) + more),
             active=tuple(active),
             seconds=seconds,
-            seconds_left=seconds * left / own if seconds >= _SOONEST and own > _ENOUGH * (own + left) else None,
-            remaining_work=left / total if total else 0.0,
+            seconds_left=left if known else None,
+            slowness=self.pace.scale,
+            remaining_work=left / (seconds + left) if known and left > 0.0 else 0.0 if known else 1.0,
         )
+
+    def left(
+        self, plans: Sequence[Plan], active: Mapping[Episode, AtWork], workers: int, worlds: int
+    ) -> tuple[Work, float]:
+        """Return the work that the busiest worker has left, and how many episodes may be required beyond those that are.
+
+        Args:
+            worlds: of each worker.
+        """
+        rounds, usual = self._usual_search(plans)
+        total, longest, alone, more = 0.0, 0.0, 0.0, 0.0
+        for found in plans:
+            chain, mine, single = 0.0, 0.0, 0.0
+            for stage in ("search", "eval"):
+                each = [self._rest(e, active.get(e)) for e in found.required if e.stage == stage]
+                mine += sum(steps for _, steps in each)
+                chain += max((loops for loops, _ in each), default=0.0)
+                # tests share a worker; each quality episode has one
+                single += (sum if stage == "search" else _largest)([steps for _, steps in each])
+            possible = {e: p for e, p in found.possible.items() if e.stage == "search"}
+            if possible:
+                length, counted = (
+                    self.lengths.of(next(iter(possible))),
+                    [e for e in found.counted if e.stage == "search"],
+                )
+                ahead = min(max(rounds - self._played(counted), 0.5), len({e.level for e in possible}))
+                tests = min(max(usual - len(counted), ahead), 0.8 * len(possible))
+                if possible.keys() <= active.keys() | self.lengths.seen:  # all of them have begun already
+                    chain = max(chain, *(self._rest(e, active[e])[0] for e in possible if e in active), 0.0)
+                else:
+                    chain += ahead * length.longest
+                mine += tests * length.steps
+                single += tests * length.steps
+                more += tests
+            quality = {e: p for e, p in found.possible.items() if e.stage == "eval"}
+            if quality:
+                each = [self._rest(e, active.get(e)) for e in quality]
+                seeds, passed = len({e.seed for e in quality}), min(sum(quality.values()), 1.0)
+                evaluated = min(self._levels, len({e.level for e in quality})) * seeds * passed
+                steps = sum(p * s for p, (_, s) in zip(quality.values(), each, strict=True)) / sum(quality.values())
+                mine += evaluated * steps
+                single += passed * steps
+                chain += passed * sum(loops for loops, _ in each) / len(each)
+                more += evaluated
+            total, longest, alone = total + mine, max(longest, chain), max(alone, single)
+        uneven = _UNEVEN if any(found.possible for found in plans) else 1.0
+        share, longest, alone = (uneven * v for v in (total / workers, longest, alone))
+        return Work(loops=max(longest, share / worlds), world_steps=max(share, alone)), more
+
+    def _rest(self, episode: Episode, at: AtWork | None) -> tuple[float, float]:
+        """Return the control steps in a row, and of all worlds, that an episode has yet to take."""
+        length = self.lengths.of(episode)
+        if at is None:
+            return length.longest, length.parts * length.steps
+        over = _OVERTIME * max(length.limit - at.youngest, 0.0) if episode.stage == "search" else 0.0
+        rest = max(length.longest - at.youngest, over, 5.0)
+        steps = max(
+            length.parts * length.steps - at.steps, at.parts * length.steps - at.spent, at.parts * min(rest, 5.0), over
+        )
+        return rest, steps
+
+    def _played(self, tests: Sequence[Episode]) -> int:
+        """Return the rounds that a search has begun."""
+        if self._suite.scoring.level == "area":
+            return 1 if len(tests) <= self._suite.scoring.levels else 2
+        return max(len({e.level for e in tests}), 1)
+
+    def _usual_search(self, plans: Sequence[Plan]) -> tuple[float, float]:
+        """Return the rounds and the tests that searches usually have, from those that have found their level, too."""
+        rounds, tests = (_FORMER * usual for usual in self._search)
+        weight = _FORMER
+        for found in plans:
+            mine = [e for e in found.counted if e.stage == "search"]
+            if mine and not found.possible and not any(e.stage == "search" for e in found.required):
+                rounds += self._played(mine) + (self._suite.scoring.level != "area")
+                tests += len(mine)
+                weight += 1.0
+        return rounds / weight, tests / weight
+
+
+def watcher(meter: ProgressMeter, watch: Callable[[Status], None]) -> Callable[[Playing], None]:
+    """Return the function that tells ``watch`` a few times a second how far playing is."""
+    next_time = 0.0
+
+    def on_progress(playing: Playing) -> None:
+        nonlocal next_time
+        if time.perf_counter() >= next_time:
+            watch(meter.look(playing))
+            next_time = time.perf_counter() + _WATCH_INTERVAL
+
+    return on_progress
+
+
+def _largest(values: Sequence[float]) -> float:
+    return max(values, default=0.0)

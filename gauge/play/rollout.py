@@ -12,6 +12,7 @@ interval. ``CpuStep`` or ``GpuStep`` takes the control steps; ``WorldBuffers`` h
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from itertools import islice
@@ -29,7 +30,7 @@ from ..suite import Suite
 from .control_step import ControlStep, CpuStep, GpuStep
 from .feet import foot_torsion, torsion_varies
 from .sampling import Samples
-from .segments import Segment, SegmentOutcome, SegmentQueue
+from .segments import AtWork, Segment, SegmentOutcome, SegmentQueue
 from .world_buffers import SegmentCounts
 
 POLL_INTERVAL = 10
@@ -85,6 +86,10 @@ class Rollout:
         self._turning = torsion_varies(suite, backend)
         self.control_steps = 0
         """Control steps so far, each of all worlds."""
+        self.world_steps = 0
+        """Control steps so far, added up over worlds at work."""
+        self.busy_seconds = 0.0
+        """Time in the loop so far [s], that of the first call left out: then engines compile."""
         self.physics_steps = 0
         """Physics steps up to the last poll that found something, added up over worlds."""
 
@@ -119,12 +124,21 @@ class Rollout:
         """Return the number of segments that could begin at once beside those that wait."""
         return self.free_worlds - len(self._queue)
 
-    def ages(self) -> dict[Episode, int]:
-        """Return the episodes at work, and the control steps played of each, added up over its segments."""
-        ages: dict[Episode, int] = {}
+    def at_work(self) -> dict[Episode, AtWork]:
+        """Return how far the episodes at work are."""
+        spent: dict[Episode, list[int]] = {}
         for world, segment in self._segments.items():
-            ages[segment.episode] = ages.get(segment.episode, 0) + self.control_steps - self._began[world]
-        return {episode: age + self._queue.steps_behind(episode) for episode, age in ages.items()}
+            spent.setdefault(segment.episode, []).append(self.control_steps - self._began[world])
+        waiting = self._queue.waiting()
+        return {
+            episode: AtWork(
+                steps=sum(ages) + self._queue.steps_behind(episode),
+                parts=len(ages) + waiting.get(episode, 0),
+                spent=sum(ages),
+                youngest=0 if episode in waiting else min(ages),
+            )
+            for episode, ages in spent.items()
+        }
 
     # ---- the loop -------------------------------------------------------------------------------------------------
 
@@ -138,6 +152,7 @@ class Rollout:
         Raises:
             PolicyError: the policy's output is not finite.
         """
+        first, began = self.control_steps == 0, time.perf_counter()
         with torch.inference_mode():
             records = self.poll()
             self.begin()
@@ -145,6 +160,8 @@ class Rollout:
                 self.launch()
             if self.poll_interval == 1:
                 records += self.poll()
+        if not first:
+            self.busy_seconds += time.perf_counter() - began
         return records
 
     def begin(self) -> None:
@@ -169,6 +186,7 @@ class Rollout:
         """Take the control steps up to the next poll."""
         self._step.run(self.poll_interval)
         self.control_steps += self.poll_interval
+        self.world_steps += self.poll_interval * len(self._segments)
         self._launched = True
 
     def poll(self) -> list[Record]:

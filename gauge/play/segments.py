@@ -7,9 +7,10 @@ one of them does to another in a row (a fall ends its goal, a penetration starts
 from __future__ import annotations
 
 import math
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,6 +59,19 @@ class SegmentOutcome:
     """True if a penetration made a target goal start again."""
     until_penetration: SegmentOutcome | None = None
     """The outcome of a velocity segment up to its first penetration, if one matters; the segment itself ran on."""
+
+
+class AtWork(NamedTuple):
+    """How far an episode is."""
+
+    steps: int
+    """Control steps so far, added up over its segments."""
+    parts: int
+    """Segments at work or waiting; others may follow."""
+    spent: int
+    """Control steps of those at work."""
+    youngest: int
+    """Control steps of the one that has taken the fewest."""
 
 
 class SegmentRules:
@@ -228,6 +242,10 @@ class SegmentQueue:
         for episode in episodes:
             if episode.stage != "search":
                 self._waiting.extend(self._begin(episode))
+
+    def waiting(self) -> dict[Episode, int]:
+        """Return the number of segments that wait, by episode."""
+        return Counter(segment.episode for segment in self._waiting)
 
     def take(self, most: int) -> list[Segment]:
         """Return up to ``most`` segments to play now."""

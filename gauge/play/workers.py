@@ -39,7 +39,9 @@ from ...terrains.registry import make_terrain
 from ..episodes import Episode, Record
 from ..motors import joint_parameters
 from ..suite import Suite
+from .remaining import Work
 from .rollout import Rollout
+from .segments import AtWork
 
 _FRESH = multiprocessing.get_context("spawn")
 PROGRESS_INTERVAL = 0.2
@@ -83,8 +85,12 @@ class Progress:
     """``Play`` messages that it has taken."""
     room: int = 0
     """Number of segments that it could begin at once beside those that it has."""
-    active: dict[Episode, int] = field(default_factory=dict)
-    """Episodes at work, and the control steps played of each, added up over its segments."""
+    active: dict[Episode, AtWork] = field(default_factory=dict)
+    """Episodes at work, and how far each is."""
+    busy_seconds: float = 0.0
+    """Time in the control loop so far, its first call left out [s]."""
+    work: Work = field(default_factory=Work)
+    """Control steps so far."""
     physics_steps: int = 0
     """Physics steps so far, added up over worlds."""
     engine_seconds: float | None = None
@@ -210,7 +216,9 @@ class Worker:
         return Progress(
             played=self._played,
             room=rollout.room,
-            active=rollout.ages(),
+            active=rollout.at_work(),
+            busy_seconds=rollout.busy_seconds,
+            work=Work(loops=rollout.control_steps, world_steps=rollout.world_steps),
             physics_steps=rollout.physics_steps,
             engine_seconds=rollout.backend.engine_seconds,
             stopped=self.stopped,

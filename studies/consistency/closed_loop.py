@@ -20,8 +20,8 @@ from ...backends.registry import engine_class
 from ...gauge.episodes import QUALITY, Episode, Record
 from ...gauge.goals import TARGET, command_name
 from ...gauge.plan import Records, plan_list
-from ...gauge.play.dispatcher import Dispatcher, Speculation, play
-from ...gauge.play.progress import ProgressMeter, Status
+from ...gauge.play.dispatcher import Speculation, play
+from ...gauge.play.progress import ProgressMeter, Status, watcher
 from ...gauge.play.segments import count_segments
 from ...gauge.play.workers import Job, local_workers, start_workers
 from ...gauge.scoring import command_statistics, goal_statistics
@@ -83,6 +83,13 @@ def episodes_of(cell: Cell, suite: Suite, seeds: Sequence[int]) -> list[Episode]
     ]
 
 
+def layout(variant: Variant, episodes: Sequence[Episode], suite: Suite, threads: int) -> tuple[int, int]:
+    """Return the number of workers that play episodes in an engine, and the worlds of each."""
+    count = local_workers(variant.backend, variant.device, threads=threads, most=len(episodes))
+    most = _WORLDS if torch.device(variant.device).type == "cpu" else _GPU_WORLDS
+    return count, min(sum(count_segments(e, suite) for e in episodes), most)
+
+
 def play_variant(
     variant: Variant,
     episodes: Sequence[Episode],
@@ -94,6 +101,7 @@ def play_variant(
     keep: Callable[[Record], None],
     threads: int = 1,
     watch: Callable[[Status], None] = lambda _: None,
+    meter: ProgressMeter | None = None,
 ) -> None:
     """Play the episodes of which there is no record yet, as an evaluation plays those that its plans require.
 
@@ -102,6 +110,7 @@ def play_variant(
         keep: called with each record.
         threads: CPU threads; results do not depend on them.
         watch: called now and then with how far playing is.
+        meter: estimates it; None for one that knows nothing yet.
 
     Raises:
         BackendError: the engine cannot do what the episodes need.
@@ -111,25 +120,21 @@ def play_variant(
     waiting = [e for e in episodes if e not in records]
     if not waiting:
         return
-    count = local_workers(variant.backend, variant.device, threads=threads, most=len(waiting))
-    most = _WORLDS if torch.device(variant.device).type == "cpu" else _GPU_WORLDS
+    count, worlds = layout(variant, waiting, suite, threads)
     job = Job(
         suite=suite,
         policy=policy,
         robot=robot,
         places=tuple(dict.fromkeys((e.terrain, e.level) for e in episodes)),
-        worlds=min(sum(count_segments(e, suite) for e in waiting), most),
+        worlds=worlds,
         build=variant.worlds,
         threads=max(threads // count, 1),
     )
-    plans, meter = [partial(plan_list, episodes)], ProgressMeter(suite, time.perf_counter())
-
-    def on_progress(dispatcher: Dispatcher) -> None:
-        watch(meter.look(dispatcher.plans, dispatcher.active()))
-
+    meter = meter or ProgressMeter(suite, time.perf_counter())
     forked = engine_class(variant.backend).forkable()
     with closing(start_workers(job, count, forked=forked)) as workers:
-        play(plans, records, keep, workers, speculation=Speculation(), watch=on_progress)
+        plans = [partial(plan_list, episodes)]
+        play(plans, records, keep, workers, speculation=Speculation(), watch=watcher(meter, watch))
 
 
 @dataclass(frozen=True, kw_only=True)

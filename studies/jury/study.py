@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from contextlib import closing
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from ...backends.base import BackendError, ResetState, Scene
+from ...backends.base import BackendError
 from ...backends.registry import engine_class
 from ...files.choices import cpu_threads
 from ...files.parsing import did_you_mean, one_line, shown
@@ -20,26 +20,23 @@ from ...files.writing import json_text, write_atomically
 from ...gauge.described import training_physics
 from ...gauge.evaluate import common_identity
 from ...gauge.fit import check_fit
-from ...gauge.motors import joint_parameters
 from ...gauge.plan import Records
-from ...gauge.play.progress import ProgressMeter, Status
-from ...gauge.play.workers import WorkerError, local_workers
+from ...gauge.play.progress import Status
+from ...gauge.play.remaining import Cost
+from ...gauge.play.workers import WorkerError
 from ...gauge.store import RunFolder, StoreError
 from ...gauge.suite import Suite, load_suite
 from ...robots import Robot
 from ...robots.loading import robot_digest
-from ...terrains.registry import make_terrain
 from ..consistency.closed_loop import Cell, play_variant
 from ..consistency.variants import Variant, parse_variant, place
+from ..engine_pace import EnginePace, measure_all, measure_cost
 from ..naming import folder_name
 from ..policies import Loaded, describe, load_policies
 from .request import ENGINES, PARTS, JuryError, JuryRequest, JuryStatus
 from .verdict import Bench, sentences, verdict
 
 SCHEMA = 1
-_TRIED = 20
-"""Control steps by which an engine's speed is measured."""
-_TRIED_WORLDS = 12
 
 Watch = Callable[[JuryStatus], None]
 
@@ -197,18 +194,16 @@ class _Session:
 
     def __init__(self, prepared: PreparedJury, folder: Path, *, resume: bool, watch: Watch) -> None:
         self._prepared, self._folder, self._resume, self._watch = prepared, folder, resume, watch
-        self._meter = ProgressMeter(prepared.suite, time.perf_counter())
         self._episodes = prepared.bench.episodes()
         self._threads = cpu_threads(prepared.request.threads)
         self._unable: dict[str, str] = {}
-        self._expected: dict[str, float] = {}
+        self._pace: EnginePace | None = None
         self._turn = 0
 
     def judge(self, label: str, loaded: Loaded) -> dict[str, Any]:
         """Let every engine play a policy; return its verdict."""
         prepared = self._prepared
-        if not self._expected:
-            self._measure(loaded)
+        pace = self._pace = self._pace or self._measure(label, loaded)
         home = self._folder / prepared.home(label)
         found: dict[str, Records] = {}
         for variant in prepared.engines:
@@ -216,7 +211,7 @@ class _Session:
             if variant.label in self._unable:
                 continue
             try:
-                found[variant.label] = self._play(label, loaded, variant, home)
+                found[variant.label] = self._play(label, loaded, variant, home, pace)
             except (BackendError, WorkerError) as error:
                 self._unable[variant.label] = str(error)
         if not found:
@@ -231,11 +226,11 @@ class _Session:
         block["unable"] = [{"engine": k, "reason": v} for k, v in self._unable.items()]
         return block | {"sentences": sentences(block, label)}
 
-    def _play(self, label: str, loaded: Loaded, variant: Variant, home: Path) -> Records:
+    def _play(self, label: str, loaded: Loaded, variant: Variant, home: Path, pace: EnginePace) -> Records:
         """Return the records of all episodes in an engine."""
         prepared = self._prepared
         identity = prepared.identity(label, variant)
-        began = time.perf_counter()
+        meter = pace.begin(self._turn - 1)
         with RunFolder(home / variant.folder, identity, resume=self._resume) as store:
             played = len(store.records)
             play_variant(
@@ -247,47 +242,50 @@ class _Session:
                 records=store.records,
                 keep=store.put,
                 threads=self._threads,
-                watch=lambda status: self._show(label, variant, status, time.perf_counter() - began),
+                watch=lambda status: self._show(label, variant, pace, status),
+                meter=meter,
             )
-        if played == 0:  # what it took says more of the next policies than the measured speed did
-            self._expected[variant.label] = time.perf_counter() - began
+        pace.end(counts=played == 0)
         return store.records
 
-    def _show(self, label: str, variant: Variant, status: Status, seconds: float) -> None:
+    def _show(self, label: str, variant: Variant, pace: EnginePace, status: Status | None) -> None:
         """Tell the display how far everything is."""
-        engines, expected = [v.label for v in self._prepared.engines], self._expected
-        total = sum(expected.values()) * len(self._prepared.policies)
-        turn = self._turn - 1
-        done = sum(expected.values()) * (turn // len(engines)) + sum(
-            expected.get(x, 0.0) for x in engines[: turn % len(engines)]
-        )
-        own, share = expected[variant.label], 1.0 - status.remaining_work
-        if seconds > 0.1 * own and share > 0.05:  # by now this engine's own pace is known
-            own = seconds / share
-        left = own * status.remaining_work + max(total - done - expected[variant.label], 0.0)
+        if status is not None:
+            pace.look(status)
+        count = len(self._prepared.engines) * len(self._prepared.policies)
         self._watch(
             JuryStatus(
                 policy=label,
                 engine=variant.label,
                 number=self._turn,
-                count=len(engines) * len(self._prepared.policies),
-                share=min((done + expected[variant.label] * share) / total, 1.0) if total else 0.0,
-                seconds_left=left,
+                count=count,
+                share=pace.share,
+                seconds_left=pace.seconds_left,
             )
         )
 
-    def _measure(self, loaded: Loaded) -> None:
-        """Measure the speed of every engine on flat ground, from which the remaining time is estimated."""
+    def _measure(self, label: str, loaded: Loaded) -> EnginePace:
+        """Measure what every engine costs; one that cannot judge is noted."""
         prepared = self._prepared
-        steps = sum(self._meter.usual_steps(e) for e in self._episodes)
-        for variant in prepared.engines:
-            try:
-                seconds = _time_of_a_step(prepared, loaded, variant)
-            except BackendError as error:
-                self._unable[variant.label] = str(error)
-                continue
-            workers = local_workers(variant.backend, variant.device, threads=self._threads, most=len(self._episodes))
-            self._expected[variant.label] = steps * seconds / workers
+        measure = partial(
+            measure_cost,
+            episodes=self._episodes,
+            suite=prepared.suite,
+            robot=prepared.robot,
+            policy=loaded.policy,
+            threads=self._threads,
+        )
+        engines = prepared.engines
+        status = partial(JuryStatus, policy=label, count=len(engines) * len(prepared.policies), share=0.0)
+
+        def one(variant: Variant) -> Cost:
+            number = engines.index(variant) + 1
+            self._watch(status(engine=variant.label, number=number, seconds_left=None))
+            return measure(variant)
+
+        costs = measure_all(engines, one, lambda v, error: self._unable.update({v.label: str(error)}))
+        runs = [v for _ in prepared.policies for v in engines]
+        return EnginePace(runs, costs, self._episodes, suite=prepared.suite, threads=self._threads)
 
 
 def _family(name: str) -> str:
@@ -296,29 +294,3 @@ def _family(name: str) -> str:
         return engine_class(name).family or name
     except BackendError:
         return name
-
-
-def _time_of_a_step(prepared: PreparedJury, loaded: Loaded, variant: Variant) -> float:
-    """Return the time that a control step of one world takes [s], with the robot standing on flat ground."""
-    scene = Scene(
-        robot=prepared.robot,
-        parameters=joint_parameters(prepared.suite, prepared.robot, loaded.policy.contract),
-        terrains=(make_terrain("flat"),),
-        terrain_index=(0,) * _TRIED_WORLDS,
-        physics=prepared.suite.physics,
-    )
-    with closing(variant.worlds(scene, threads=1)) as backend:
-        pose, position, upright = (
-            torch.tensor(row, device=backend.device, dtype=backend.dtype).expand(_TRIED_WORLDS, -1)
-            for row in (
-                prepared.robot.default_joint_position,
-                (0.0, 0.0, prepared.robot.stand_height),
-                (1.0, 0.0, 0.0, 0.0),
-            )
-        )
-        backend.reset(ResetState(base_position=position, base_quaternion=upright, held_target=pose))
-        backend.step(pose)
-        began = time.perf_counter()
-        for _ in range(_TRIED):
-            backend.step(pose)
-        return (time.perf_counter() - began) / (_TRIED * _TRIED_WORLDS)

@@ -6,6 +6,7 @@ import logging
 import os
 import subprocess
 import sys
+import time
 from contextlib import nullcontext
 from pathlib import Path
 
@@ -62,17 +63,44 @@ def test_commands_can_be_pasted_into_a_shell(monkeypatch):
 
 
 def test_progress_is_plain_lines_without_a_terminal(monkeypatch):
-    clock = iter([0.0, 5.0, 12.0, 13.0, 14.0])
-    monkeypatch.setattr("gaitgauge.cli.progress.time.monotonic", lambda: next(clock))
+    clock = iter([0.0, 5.0, 5.0, 12.0, 12.0, 13.0, 13.0, 14.0, 14.0])
+    monkeypatch.setattr("gaitgauge.cli.progress._TICK", 100.0)
 
     def show(terminal):
-        with ProgressDisplay(terminal, "gauging") as display:
+        with ProgressDisplay(terminal, "gauging", clock=lambda: next(clock)) as display:
             display.update(0.1, "1 of 9")
             display.update(0.2, "2 of 9", {"now:": "[/flat]"})
             display.update(0.3, "3 of 9")
             display.update(1.0, "9 of 9", last=True)
 
     assert shown(show) == "12 s: gauging, 2 of 9, now: [/flat]\n14 s: gauging, 9 of 9\n"
+
+
+def test_no_display_is_silent_while_nothing_is_heard(monkeypatch):
+    """An engine compiled for minutes without a line; between two updates the remaining time counts down."""
+    monkeypatch.setattr("gaitgauge.cli.progress._TICK", 0.001)
+    now = 0.0
+
+    def show(terminal):
+        nonlocal now
+        with ProgressDisplay(terminal, "gauging", clock=lambda: now) as display:
+            for now in (9.0, 18.0):
+                _until(terminal, f"{now:g} s: ")
+            display.update(0.5, "1 of 2", left=25.0)
+            for now in (27.0, 45.0):
+                _until(terminal, f"{now:g} s: ")
+
+    lines = "9 s: gauging, starting", "18 s: gauging, starting", "27 s: gauging, 1 of 2, about 16 s left"
+    assert shown(show).splitlines() == [*lines, "45 s: gauging, 1 of 2, about 1 s left"]
+
+
+def _until(terminal, text):
+    """Wait until a terminal shows a text."""
+    for _ in range(5000):
+        if text in terminal.file.getvalue():
+            return
+        time.sleep(0.001)
+    raise AssertionError(f"no {text}")
 
 
 def test_progress_is_a_block_on_a_terminal():

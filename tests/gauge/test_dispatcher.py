@@ -10,7 +10,7 @@ from gaitgauge.gauge.episodes import Record
 from gaitgauge.gauge.pipelines import Environment
 from gaitgauge.gauge.plan import Plan, PlanRules, plan, plan_list
 from gaitgauge.gauge.play.dispatcher import Speculation, play
-from gaitgauge.gauge.play.segments import count_segments
+from gaitgauge.gauge.play.segments import AtWork, count_segments
 from gaitgauge.gauge.play.workers import Drop, Failed, Finished, Lost, Play, Progress, Stop
 from gaitgauge.gauge.suite import load_suite
 from scripted_gauge import DIAGONAL, MAXIMUM, TARGET, episode
@@ -66,7 +66,7 @@ class Workers:
         return Progress(
             played=self.played[worker],
             room=self.worlds - sum(map(count_segments, have)),
-            active=dict.fromkeys(have, 1),
+            active=dict.fromkeys(have, AtWork(steps=1, parts=1, spent=1, youngest=1)),
             physics_steps=10,
             engine_seconds=0.5,
             stopped=self.stopped[worker],

@@ -430,8 +430,8 @@ def test_segments_wait_for_free_worlds_and_what_is_finished_is_handed_over_at_on
     ended, most = [], []
     while not rollout.idle:
         ended += [(r.episode.seed, rollout.control_steps) for r in rollout.advance()]
-        active = rollout.ages()
-        assert all(0 <= age <= 6 * STEPS for age in active.values())
+        active = rollout.at_work()
+        assert all(0 <= at.spent <= at.steps <= 6 * STEPS for at in active.values())
         most.append(len(active))
     # six segments an episode, four at a time
     assert ended == [(0, 2 * STEPS), (1, 3 * STEPS), (2, 5 * STEPS), (3, 6 * STEPS), (4, 8 * STEPS)]
@@ -447,7 +447,7 @@ def test_level_tests_go_before_waiting_segments():
         rollout.advance()
     crossing = episode(TARGET, stage="search")
     rollout.play([crossing])
-    while crossing not in rollout.ages() or not rollout.ages()[crossing]:
+    while crossing not in rollout.at_work() or not rollout.at_work()[crossing].steps:
         rollout.advance()
     assert rollout.control_steps == STEPS + 1
     assert [r.episode.stage for r in to_the_end(rollout)] == ["search", "eval"]
@@ -464,9 +464,9 @@ def test_cancelled_episodes_leave_their_worlds(poll_interval):
     (first,) = next(records for records in iter(rollout.advance, None) if records)
     assert first.episode == short
     assert rollout.advance() == []
-    assert long in rollout.ages()
+    assert long in rollout.at_work()
     rollout.drop([long])
-    assert long not in rollout.ages()
+    assert long not in rollout.at_work()
     (record,) = to_the_end(rollout)
     assert record.episode == last
     (alone,) = run(suite, fake(suite, worlds=8), [last])

@@ -1,0 +1,142 @@
+"""Measure how well commands estimate their remaining time, as their users see it.
+
+    python benchmarks/remaining_time.py evaluate jury --out timelines
+    python benchmarks/remaining_time.py --replay timelines
+
+A command runs with a terminal of its own; every remaining time that it shows is noted with the time at which it is shown. Printed
+are, for each command, the error of the remaining time at each tenth of the command's duration (shown over true, less one), and
+the longest time without anything new on the terminal.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import pty
+import re
+import shlex
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+COMMANDS = {
+    "evaluate": "evaluate pretrained --suite demo",
+    "compare": "compare pretrained {standing} --suite demo --terrain flat",
+    "consistency": "consistency pretrained",
+    "jury": "jury pretrained",
+    "trial": "trial pretrained --scenario all --repeats 10",
+    "latent": "latent pretrained",
+    "worst": "worst pretrained --minutes 2 --no-films",
+    "replay": "replay {log} --robot go2",
+    "sweep": "sweep {sweep}",
+}
+"""Command lines by name; ``{…}`` are files that ``--with NAME=FILE`` gives."""
+_LEFT = re.compile(r"about (?:(\d+) h )?(?:(\d+) min ?)?(?:(\d+) s)? ?left")
+_CODES = re.compile(rb"\x1b\[[0-9;?]*[A-Za-z]")
+
+
+def record(arguments: Sequence[str]) -> dict[str, object]:
+    """Run a command line of ``gaitgauge`` on a terminal; return its timeline.
+
+    Returns:
+        ``seconds``: the command's duration; ``shown``: pairs of a time and the remaining time shown at it, both in seconds;
+        ``silence``: the longest time without a change of the screen [s]; ``code``: exit code.
+    """
+    ours, theirs = pty.openpty()
+    environment = os.environ | {"COLUMNS": "200", "TERM": "xterm"}
+    began = time.monotonic()
+    process = subprocess.Popen(
+        [sys.executable, "-m", "gaitgauge.cli.main", *arguments],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=theirs,
+        env=environment,
+    )
+    os.close(theirs)
+    shown: list[tuple[float, float]] = []
+    last, silence, before = began, 0.0, b""
+    while True:
+        try:
+            data = os.read(ours, 1 << 16)
+        except OSError:  # the terminal's other end is closed
+            break
+        if not data:
+            break
+        now = time.monotonic()
+        text = _CODES.sub(b"", data)
+        if text.strip() and text != before:
+            silence, last, before = max(silence, now - last), now, text
+        for found in _LEFT.finditer(text.decode(errors="replace")):
+            hours, minutes, seconds = (int(part or 0) for part in found.groups())
+            shown.append((round(now - began, 2), 3600.0 * hours + 60.0 * minutes + seconds))
+    code = process.wait()
+    now = time.monotonic()
+    return {
+        "command": shlex.join(arguments),
+        "seconds": round(now - began, 2),
+        "silence": round(max(silence, now - last), 2),
+        "shown": [pair for i, pair in enumerate(shown) if i == 0 or pair[0] - shown[i - 1][0] > 0.2],
+        "code": code,
+    }
+
+
+def errors(timeline: dict[str, object]) -> list[float | None]:
+    """Return the relative error of the remaining time at 1/10 … 9/10 of the duration; None where nothing was shown yet."""
+    total, shown = float(timeline["seconds"]), timeline["shown"]  # type: ignore[arg-type]
+    found: list[float | None] = []
+    for tenth in range(1, 10):
+        now = total * tenth / 10
+        before = [(at, left) for at, left in shown if at <= now]  # type: ignore[attr-defined]
+        if not before:
+            found.append(None)
+            continue
+        at, left = before[-1]
+        found.append((left - (now - at)) / (total - now) - 1.0)
+    return found
+
+
+def table(timelines: dict[str, dict[str, object]]) -> str:
+    """Return the errors of several timelines, a line each."""
+    heads = "".join(f"{tenth / 10:>7.1f}" for tenth in range(1, 10))
+    lines = [f"{'command':<14}{'seconds':>8}{heads}{'worst':>8}{'silence':>9}"]
+    for name, timeline in timelines.items():
+        found = errors(timeline)
+        cells = "".join(f"{'–':>7}" if e is None else f"{100 * e:>+6.0f}%" for e in found)
+        worst = max((abs(e) for e in found if e is not None), default=float("nan"))
+        lines.append(f"{name:<14}{timeline['seconds']:>8.1f}{cells}{100 * worst:>7.0f}%{timeline['silence']:>7.1f} s")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Run or replay the commands that are named, and print the table."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("commands", nargs="*", choices=[*COMMANDS, []], metavar="COMMAND", help=", ".join(COMMANDS))
+    parser.add_argument("--out", type=Path, help="folder of the timelines, one JSON file each")
+    parser.add_argument("--replay", type=Path, help="folder of timelines to print in place of running anything")
+    parser.add_argument(
+        "--with", dest="files", action="append", default=[], metavar="NAME=FILE", help="a file for {NAME}"
+    )
+    parser.add_argument("--also", default="", help="further options of the commands")
+    options = parser.parse_args()
+    timelines: dict[str, dict[str, object]] = {}
+    if options.replay:
+        timelines = {path.stem: json.loads(path.read_text()) for path in sorted(options.replay.glob("*.json"))}
+    files = dict(pair.partition("=")[::2] for pair in options.files)
+    for name in options.commands:
+        with tempfile.TemporaryDirectory() as folder:
+            line = COMMANDS[name].format_map(files) + f" {options.also} --out {folder}/out"
+            timelines[name] = record(shlex.split(line))
+        if options.out:
+            options.out.mkdir(parents=True, exist_ok=True)
+            (options.out / f"{name}.json").write_text(json.dumps(timelines[name]) + "\n")
+        print(table({name: timelines[name]}), flush=True)
+    if len(timelines) > 1 or options.replay:
+        print(table(timelines))
+
+
+if __name__ == "__main__":
+    main()
