@@ -77,7 +77,7 @@ class ObservationBuilder:
                     )
                 self._scans[i] = HeightScan(term, ground, num_episodes, contract.control_period)
         self._clock_offsets = [self._tensor(t.offsets) for t in contract.observation]
-        self._clocks = torch.zeros(num_episodes, len(contract.observation), device=self.device)
+        self.clocks = torch.zeros(num_episodes, len(contract.observation), device=self.device)
         places = tuple(place for places in contract.inputs.values() for place in places)
         as_kept = places == tuple(range(contract.frames * contract.frame_width))
         self._places = None if as_kept else self._tensor(places, torch.int64)
@@ -99,11 +99,11 @@ class ObservationBuilder:
             scan.reset(episodes)
         if episodes is None:
             self._frames.zero_()
-            self._clocks.zero_()
+            self.clocks.zero_()
             self._fresh.fill_(True)
         else:
             self._frames.masked_fill_(episodes[:, None, None], 0.0)
-            self._clocks.masked_fill_(episodes[:, None], 0.0)
+            self.clocks.masked_fill_(episodes[:, None], 0.0)
             self._fresh.logical_or_(episodes)
 
     def build(
@@ -173,7 +173,7 @@ class ObservationBuilder:
         """Return the waves of a gait's clocks, (N, W), and let the clocks go on by one control period."""
         term = self.contract.observation[number]
         assert term.period is not None  # of the term's own check
-        clock, resting = self._clocks[:, number], command.norm(dim=1) < RESTING
+        clock, resting = self.clocks[:, number], command.norm(dim=1) < RESTING
         cycles = (clock * (self.contract.control_period / term.period))[:, None] + self._clock_offsets[number]
         if term.at_rest == "half":
             cycles = torch.where(resting[:, None], 0.5, cycles)

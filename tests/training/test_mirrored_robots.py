@@ -12,9 +12,12 @@ from gaitgauge.robots import load_robot, robot_names
 from gaitgauge.terrains.registry import make_terrain
 from gaitgauge.training.algorithms.symmetry import build_mirror
 from gaitgauge.training.environment.configuration import ObservationConfiguration
+from gaitgauge.training.environment.policy_interface import driven_robot, training_contract
+from gaitgauge.training.tasks import TASKS
 
 ROBOTS = sorted(robot_names())
 LEFT_TO_RIGHT = torch.tensor([1.0, -1.0, 1.0], dtype=torch.float64)
+COMMAND = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
 PAIRS = 3
 """Worlds, each with its mirror image behind all of them."""
 
@@ -33,11 +36,20 @@ def test_mirroring_twice_is_nothing(name, group):
 
 
 # Left and right of ANYmal's model are alike; a Go1's trunk has its mass 2 mm beside the middle. A wrong sign is 0.1 or more.
-@pytest.mark.parametrize(("name", "apart"), [("anymal_c", 1e-4), ("go1", 0.03), ("go2", 2e-3)])
+# The G1 with its legs driven and a gait clock for each foot.
+@pytest.mark.parametrize(("name", "apart"), [("anymal_c", 1e-4), ("go1", 0.03), ("go2", 2e-3), ("g1-walk", 0.03)])
 def test_a_mirrored_state_steps_to_a_mirrored_state(name, apart):
     """Turning, pushed, with joints anywhere about the pose and random targets, on a ground on which it lands."""
-    robot = load_robot(name)
-    mirror, draw = mirror_of(robot), torch.Generator().manual_seed(4)
+    if name in TASKS:
+        settings = TASKS[name].environment
+        robot = driven_robot(load_robot(settings.robot), settings)
+        contract = training_contract(robot, robot.parameters["training"], settings)
+    else:
+        robot = load_robot(name)
+        contract = standard_contract(robot)
+    mirror = build_mirror(ObservationConfiguration(), contract=contract, robot=robot)
+    whole = build_mirror(ObservationConfiguration(), contract=standard_contract(load_robot(robot.name)), robot=robot)
+    draw = torch.Generator().manual_seed(4)
     scene = Scene(
         robot=robot,
         parameters=robot.parameters["gauge"],
@@ -69,14 +81,16 @@ def test_a_mirrored_state_steps_to_a_mirrored_state(name, apart):
                 base_quaternion=with_images(turn, turned),
                 base_linear_velocity=with_images(drawn(PAIRS, 3, size=0.5), lambda v: v * LEFT_TO_RIGHT),
                 base_angular_velocity=with_images(drawn(PAIRS, 3, size=0.5), axial),
-                joint_position=default + with_images(drawn(PAIRS, 12, size=0.2), mirror.action),
+                joint_position=default + with_images(drawn(PAIRS, robot.num_joints, size=0.2), whole.action),
             )
         )
-        builder = ObservationBuilder(standard_contract(robot), robot, 2 * PAIRS)
-        command = torch.zeros(2 * PAIRS, 3).double()
+        builder = ObservationBuilder(contract, robot, 2 * PAIRS)
+        command = with_images(torch.tensor([[0.5, 0.2, 0.3]] * PAIRS).double(), lambda v: v * COMMAND)
+        # another half of a cycle: where one foot swings, the other one does in the mirror
+        builder.clocks[PAIRS:] = 20.0
         moved = torch.zeros(())
         for _ in range(10):
-            action = with_images(drawn(PAIRS, 12, size=0.5), mirror.action)
+            action = with_images(drawn(PAIRS, contract.num_joints, size=0.5), mirror.action)
             backend.step(builder.targets(action))
             frame = builder.build(backend.state, command, action).double()
             difference = mirror.policy(frame[:PAIRS]) - frame[PAIRS:]

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import pytest
 from gaitgauge.robots import load_robot
-from gaitgauge.training.environment.environment import training_contract
+from gaitgauge.training.environment.policy_interface import training_contract
 from gaitgauge.training.overrides import TaskError, apply_overrides, override_keys
 from gaitgauge.training.tasks import TASKS, find_task
 
@@ -161,7 +161,8 @@ def test_every_key_can_be_set_to_what_it_is():
 def test_tasks():
     methods = {"go2-moe-cts": "cts", "go2-cts": "cts", "go2-moe-ng": "cts", "go2-ac-moe": "ac_moe", "go2-mcp": "mcp"}
     methods |= {"go2-him": "him", "go2-dreamwaq": "dreamwaq"}
-    assert list(TASKS) == [*methods, "go2-flat", "go2-sprint", "toy"]
+    bipeds = ["g1-walk", "g1-rough", "g1-walk-dreamwaq", "g1-rough-dreamwaq"]
+    assert list(TASKS) == [*methods, "go2-flat", "go2-sprint", "toy", *bipeds]
     moe, plain, flat, sprint = map(find_task, ("go2-moe-cts", "go2-cts", "go2-flat", "go2-sprint"))
     for name, method in methods.items():
         task = find_task(name)

@@ -21,8 +21,8 @@ from gaitgauge.training.environment.configuration import (
     TerminationConfiguration,
 )
 from gaitgauge.training.environment.curriculum import build_palette
-from gaitgauge.training.environment.environment import training_contract
 from gaitgauge.training.environment.own_terms import resolve
+from gaitgauge.training.environment.policy_interface import training_contract
 from gaitgauge.training.environment.terrain_configuration import TerrainConfiguration, TileConfiguration
 from gaitgauge.training.tasks import TaskError, find_task
 from gaitgauge_fake_engine import FakeScript

@@ -13,7 +13,19 @@ from gaitgauge.training.environment.reward_configuration import (
     RewardWeights,
 )
 from gaitgauge.training.environment.rewards import REWARD_TERMS, RewardFunction
-from gaitgauge.training.environment.step_inputs import StepInputs
+from gaitgauge.training.environment.step_inputs import FootInputs, StepInputs
+
+FEET = FootInputs(
+    contact=torch.ones(2, 4, dtype=torch.bool),
+    air_time=torch.zeros(2, 4),
+    contact_time=torch.full((2, 4), 0.3),
+    clearance=torch.zeros(2, 4),
+    tilt=torch.zeros(2, 4),
+    apart=torch.full((2,), 0.2),
+    swing=torch.zeros(2, 4, dtype=torch.bool),
+    wanted_clearance=torch.zeros(2, 4),
+)
+STEP = torch.tensor([[True, False, False, True], [True] * 4])
 
 
 @pytest.fixture
@@ -62,6 +74,11 @@ def quiet():
         failed=torch.zeros(2, dtype=torch.bool),
         base_height_target=0.38,
         foot_height_length=0.0095,
+        feet=FEET,
+        pose_weight=torch.tensor([2.0, 0.5] * 6),
+        least_apart=0.15,
+        longest_step=0.4,
+        clock_sigma=0.008,
     )
 
 
@@ -148,6 +165,37 @@ CASES = {
     "torque_change": ({"joint_torque": joints(2.0, 1.0), "previous_joint_torque": joints(0.0, 4.0)}, 13.0, 0.0),
     "stand_still": ({"joint_position": joints(0.5, -0.25)}, 0.75, 0.0),
     "termination": ({"failed": torch.tensor([True, False])}, 1.0, 0.0),
+    "alive": ({"failed": torch.tensor([True, False])}, 0.0, 1.0),
+    "orientation": ({"base_quaternion_w": one_world([0.8, 0.0, 0.6, 0.0], 4)}, 0.96**2, 0.0),
+    "pose": ({"joint_position": joints(0.2, -0.3)}, 2.0 * 0.04 + 0.5 * 0.09, 0.0),
+    "foot_tilt": ({"feet": replace(FEET, tilt=torch.tensor([[0.1, 0.2, 0.0, 0.0], [0.0] * 4]))}, 0.3, 0.0),
+    "foot_slip": (
+        {
+            "feet": replace(FEET, contact=STEP),
+            "foot_velocity_w": feet([[1.0, 2.0, 9.0], [3.0, 3.0, 3.0], [0.0] * 3, [0.0, 1.0, 0.0]]),
+        },
+        6.0,
+        0.0,
+    ),
+    "feet_apart": ({"feet": replace(FEET, apart=torch.tensor([0.05, 0.2]))}, 0.1, 0.0),
+    "air_time": (
+        {
+            "feet": replace(FEET, contact=STEP, air_time=torch.tensor([[0.0, 0.25, 0.9, 0.0], [0.0] * 4])),
+            "command": torch.tensor([[0.0, 0.0, 0.5]] * 2),
+        },
+        0.25,
+        0.0,
+    ),
+    "clock_height": (
+        {"feet": replace(FEET, clearance=one_world([0.05, 0.0], 4), wanted_clearance=one_world([0.09, 0.04], 4))},
+        math.exp(-0.0032 / 0.008),
+        1.0,
+    ),
+    "clock_contact": (
+        {"feet": replace(FEET, contact=STEP, swing=torch.tensor([[False, True, False, True], [False] * 4]))},
+        0.5,
+        1.0,
+    ),
 }
 
 
@@ -165,6 +213,21 @@ def test_term(quiet, name):
 def test_stand_still_counts_under_the_zero_command_only(quiet):
     moved = replace(quiet, joint_position=joints(0.5), command=one_world([0.0, 0.0, 0.1], 3))
     assert REWARD_TERMS["stand_still"](moved).tolist() == [0.0, 0.0]
+
+
+@pytest.mark.parametrize(
+    ("contact", "command", "expected"),
+    [([True] * 4, 0.5, 0.0), ([False] * 4, 0.5, 0.0), (STEP[0].tolist(), 0.05, 0.0), (STEP[0].tolist(), 0.5, 0.4)],
+)
+def test_only_steps_under_a_command_are_paid_and_no_longer_than_the_longest(quiet, contact, command, expected):
+    feet = replace(
+        FEET,
+        contact=torch.tensor([contact] * 2),
+        air_time=torch.full((2, 4), 0.9),
+        contact_time=torch.full((2, 4), 0.9),
+    )
+    inputs = replace(quiet, feet=feet, command=one_world([command], 3))
+    assert float(REWARD_TERMS["air_time"](inputs)[0]) == pytest.approx(expected)
 
 
 def test_weights_are_per_second_but_for_falls(quiet):
@@ -190,7 +253,7 @@ def test_weights_follow_progress(quiet):
 def test_every_weight_names_a_term():
     assert {f.name for f in fields(RewardWeights)} - {"own"} == set(REWARD_TERMS)
     parts = [{f.name for f in fields(part)} for part in (RewardWeights, RewardShapes, RewardLimits)]
-    assert {f.name for f in fields(RewardConfiguration)} == set.union(*parts) and sum(map(len, parts)) == 35
+    assert {f.name for f in fields(RewardConfiguration)} == set.union(*parts) and sum(map(len, parts)) == 49
 
 
 @pytest.mark.parametrize(

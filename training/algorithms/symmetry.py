@@ -99,27 +99,52 @@ def build_mirror(observations: ObservationConfiguration, *, contract: PolicyCont
 
     Raises:
         RobotError: a joint or a foot has no mirror image in the contract's default pose.
-        SymmetryError: there are observations of one's own.
+        SymmetryError: there are observations of one's own, or the policy drives one joint of a pair.
     """
     if observations.own:
         raise SymmetryError(
             f"The mirror image of the observation '{observations.own[0].name}' is not known; set "
             "training.algorithm.symmetry=none."
         )
-    # angles are relative to the contract's pose, in its order
-    image = mirror_image(
-        replace(robot, joint_names=contract.joint_names, default_joint_position=contract.default_joint_position)
-    )
-    joints = MirrorMap(torch.tensor(image.joint), torch.tensor(image.sign))
-    frame = MirrorMap.joined([_image(term, joints) for term in contract.observation])
+    # angles are relative to the contract's pose, in its order, with joints that the policy does not drive behind
+    held = [name for name in robot.joint_names if name not in contract.joint_names]
+    poses = dict(zip(robot.joint_names, robot.default_joint_position, strict=True))
+    pose = (*contract.default_joint_position, *(poses[name] for name in held))
+    names = (*contract.joint_names, *held)
+    image = mirror_image(replace(robot, joint_names=names, default_joint_position=pose))
+    driven = image.joint[: contract.num_joints]
+    if max(driven) >= contract.num_joints:
+        odd = next(name for name, found in zip(names, driven, strict=False) if found >= contract.num_joints)
+        raise SymmetryError(
+            f"The policy drives the joint '{odd}' and not its mirror image; drive both, or set training.algorithm.symmetry=none."
+        )
+    joints = MirrorMap(torch.tensor(driven), torch.tensor(image.sign[: contract.num_joints]))
     feet = MirrorMap(torch.tensor(image.foot), torch.ones(len(image.foot)))
+    frame = MirrorMap.joined([_clocks(term, feet) or _image(term, joints) for term in contract.observation])
+    # torques and accelerations of all joints, in the robot's order
+    place = [names.index(name) for name in robot.joint_names]
+    whole = MirrorMap(
+        torch.tensor([place.index(image.joint[i]) for i in place]), torch.tensor([image.sign[i] for i in place])
+    )
     scan = scan_pattern(observations.scan_length, observations.scan_width, observations.scan_spacing, "cpu")
     return Mirror(
         policy=frame,
         history=MirrorMap.joined([frame] * observations.history_length),
-        privileged=MirrorMap.joined([VECTOR, frame, feet, joints, joints, mirror_points(scan)]),
+        privileged=MirrorMap.joined([VECTOR, frame, feet, whole, whole, mirror_points(scan)]),
         action=joints,
     )
+
+
+def _clocks(term: ObservationTerm, feet: MirrorMap) -> MirrorMap | None:
+    """Return the mirror map of a gait's clocks, one for each foot, that change places as the feet do; None for another term."""
+    if term.name != "gait_phase":
+        return None
+    if len(term.offsets) != feet.width:
+        raise SymmetryError(
+            f"The gait has {len(term.offsets)} clocks for {feet.width} feet, and its mirror image is not known; give one for each, or "
+            "set training.algorithm.symmetry=none."
+        )
+    return MirrorMap.joined([feet] * len(term.waves))
 
 
 def _image(term: ObservationTerm, joints: MirrorMap) -> MirrorMap:

@@ -54,6 +54,23 @@ class JointConfiguration:
     """Passive damping of every joint [N·m·s/rad]; None keeps the set's."""
     friction_loss: Torque | None = None
     """Dry friction of every joint [N·m]; None keeps the set's. 0 spares the solver twelve constraints per world."""
+    driven: tuple[str, ...] = ()
+    """Roles of the joints that the policy drives, or their beginnings (``hip``); motors hold all others in the standing pose. The robot's
+    description has a variant with these joints. Empty for the robot's own choice, all joints where its description says nothing."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class GaitConfiguration:
+    """A clock that the policy sees: sine, then cosine, of one phase for each foot. It stands at half a cycle under a zero command."""
+
+    period: Positive | None = None
+    """Time of a gait cycle [s]; None for no clock."""
+    offsets: tuple[Share, ...] = (0.25, 0.75)
+    """Share of a cycle by which each foot's phase is ahead, in the order of ``foot_names``. A step's middle is at phase 0."""
+    swing_share: Annotated[float, Field(gt=0.0, le=1.0)] = 0.4
+    """Share of a cycle in which a foot is to be in the air."""
+    swing_height: Metres = 0.09
+    """Clearance that is asked for in the middle of a step [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -263,6 +280,8 @@ class TerminationConfiguration:
     """Angle between the base's z axis and the world's [rad]; None for no limit."""
     joint_velocity: Positive = 150.0
     """Joint speed beyond anything real, which counts as a diverged world [rad/s]."""
+    low: Metres | None = None
+    """Height of the base over the ground below the trunk under which an episode ends [m]. None for never."""
     stuck: Positive | None = None
     """Time without progress after which a robot that did as commanded before is stuck [s]: its episode ends as a failure and moves the
     level down. None for never."""
@@ -286,6 +305,7 @@ class EnvironmentConfiguration:
     """Longest episode [s], at least one control period."""
     physics: PhysicsOptions = TRAINING_PHYSICS
     joints: JointConfiguration = JointConfiguration()
+    gait: GaitConfiguration = GaitConfiguration()
     schedule: ScheduleConfiguration = ScheduleConfiguration()
     observations: ObservationConfiguration = ObservationConfiguration()
     rewards: RewardConfiguration = DEFAULT_REWARDS

@@ -21,24 +21,17 @@ from ...backends.base import Randomization, ResetState, Scene
 from ...backends.graphs import WARM_UP, RecordedFunction
 from ...backends.registry import make_backend
 from ...files.parsing import shown
-from ...policy.contract import History, ObservationTerm, PolicyContract, standard_contract
-from ...policy.observation_table import HEIGHT_SCAN
-from ...policy.robot_of import REMEMBERED
-from ...robots.base import JointParameters, Robot
-from ...robots.identity import identify
-from ...robots.loading import RobotError
 from ...robots.registry import load_robot
-from ...robots.sets import find_set
 from ...terrains.height_scan import heading
 from ..configuration import ConfigurationError
-from .commands import largest_commands
 from .configuration import EnvironmentConfiguration
 from .curriculum import assign_kinds, build_palette
-from .domain_randomization import draw_bodies, outside
+from .domain_randomization import draw_bodies
 from .events import EpisodeStart
 from .memory import copied, fitting, restore
 from .observations import Observations
-from .own_terms import policy_observations, resolve_own
+from .own_terms import resolve_own
+from .policy_interface import driven_robot, joint_parameters, training_contract
 from .step import EnvironmentStep, StepResult
 from .step_inputs import AFTER_RESET, AFTER_STEP, static_inputs
 
@@ -97,7 +90,7 @@ class TrainingEnvironment(VecEnv):
                 "off, without which it does nothing; turn the limit on, or leave motor_speed at 1,1"
             )
         self.cfg = self.configuration = configuration
-        self.robot = load_robot(configuration.robot)
+        self.robot = driven_robot(load_robot(configuration.robot), configuration)
         parameters = joint_parameters(self.robot, configuration)
         self.palette = build_palette(configuration.terrain)
         kind = assign_kinds([tile.share for tile in self.palette.tiles], configuration.num_envs)
@@ -112,8 +105,8 @@ class TrainingEnvironment(VecEnv):
         self.backend = make_backend(backend, scene, device=device, threads=threads)
         self.device = self.backend.device
         self.num_envs = configuration.num_envs
-        self.num_actions = self.robot.num_joints
         self.contract = training_contract(self.robot, parameters, configuration)
+        self.num_actions = self.contract.num_joints
         self._generator = torch.Generator(device=self.device)
         self._generator.manual_seed(configuration.seed)
         state = self.backend.state
@@ -336,6 +329,8 @@ class TrainingEnvironment(VecEnv):
         headings = heading(state["physics"]["base_quaternion_w"])
         older = {"commanded_heading": headings, "holds_heading": torch.zeros_like(parts.memory.holds_heading)}
         older["episode_steps"] = state["memory"]["episode_length"]
+        # and one from before gait clocks has none
+        older |= {name: getattr(parts.memory, name) for name in ("foot_air_time", "foot_contact_time", "clocks")}
         restore({**older, **state["memory"]}, parts.memory.by_name())
         self._require_below(parts.memory.level, self.palette.num_levels, "level")
         self._require_below(parts.memory.terrain_index, len(self.palette.terrains), "terrain_index")
@@ -386,49 +381,3 @@ class TrainingEnvironment(VecEnv):
         """Refuse saved numbers of things that are not there: engines read memory by them, unchecked."""
         if numbers.numel() and not 0 <= int(numbers.min()) <= int(numbers.max()) < count:
             raise ValueError(f"the saved environment does not fit: '{name}' is not between 0 and {count - 1}")
-
-
-def joint_parameters(robot: Robot, configuration: EnvironmentConfiguration) -> JointParameters:
-    """Return the joint constants of the training physics. Raises ConfigurationError: the robot has no such parameter set."""
-    settings = configuration.joints
-    try:
-        found = find_set(robot, settings.parameters)[1]
-    except RobotError as error:
-        raise ConfigurationError(f"environment.joints.parameters is '{settings.parameters}', but {error}") from error
-    for sentence in outside(configuration.randomization, found, robot.joint_names):
-        _log.warning("%s", sentence)
-    changed: dict[str, Any] = {
-        name: (value,) * robot.num_joints
-        for name in ("armature", "joint_damping", "friction_loss")
-        if (value := getattr(settings, name)) is not None
-    }
-    return replace(found, **changed)
-
-
-def training_contract(
-    robot: Robot, parameters: JointParameters, configuration: EnvironmentConfiguration
-) -> PolicyContract:
-    """Return the interface of a policy trained here: one frame of observation, the gains, the control period and the largest
-    commands of the training.
-
-    Raises:
-        ConfigurationError: an observation of one's own is not there, or breaks a rule.
-    """
-    tiles = [tile for tile in configuration.terrain.tiles if tile.share > 0]
-    provenance = {REMEMBERED: identify(robot, configuration.robot)}
-    standard = standard_contract(
-        robot, history=History(start=configuration.observations.history_start), provenance=provenance
-    )
-    seen = configuration.observations
-    more = tuple(ObservationTerm(name=each.name, scale=each.scale) for each in policy_observations(seen))
-    scan: dict[str, Any] = {"size": (seen.scan_length, seen.scan_width), "spacing": seen.scan_spacing}
-    scan |= {"reference": (seen.height_offset,), "clip": 1.0}
-    more = tuple(replace(term, **scan) if term.name == HEIGHT_SCAN else term for term in more)
-    return replace(
-        standard,
-        observation=standard.observation + more,
-        command_limits=largest_commands(configuration.commands, [tile.command_limits for tile in tiles]),
-        stiffness=parameters.stiffness,
-        damping=parameters.damping,
-        control_period=configuration.physics.control_period,
-    )

@@ -23,6 +23,8 @@ EPISODE = (
     "joint_acceleration",
     "joint_torque",
     "foot_force",
+    "foot_air_time",
+    "foot_contact_time",
     "episode_rewards",
     "episode_steps",
 )
@@ -44,7 +46,7 @@ def _block(
 class EnvironmentMemory:
     """Tensors that steps change in place; they are never replaced, since a captured step holds on to them.
 
-    N worlds, J joints, T reward terms, E ways to end an episode, M metrics.
+    N worlds, J joints, A of them driven by the policy, F feet, T reward terms, E ways to end an episode, M metrics.
     """
 
     step: torch.Tensor
@@ -79,9 +81,9 @@ class EnvironmentMemory:
     shortfall: torch.Tensor
     """Share of the commanded speed that is missing of late, an exponential average, (N,)."""
     action: torch.Tensor
-    """Raw action of the last step, (N, J)."""
+    """Raw action of the last step, (N, A)."""
     previous_action: torch.Tensor
-    """Raw action of the step before, (N, J)."""
+    """Raw action of the step before, (N, A)."""
     joint_velocity: torch.Tensor
     """Joint velocities after the last step [rad/s], (N, J)."""
     joint_acceleration: torch.Tensor
@@ -90,6 +92,12 @@ class EnvironmentMemory:
     """Torques of the last step [N·m], (N, J)."""
     foot_force: torch.Tensor
     """Norm of each foot's contact force after the last step [N], (N, F)."""
+    foot_air_time: torch.Tensor
+    """Time since each foot left the ground [s], (N, F); zero where no reward asks for it."""
+    foot_contact_time: torch.Tensor
+    """Time since each foot touched the ground [s], (N, F); zero where no reward asks for it."""
+    clocks: torch.Tensor
+    """Control steps that the gait clock of each observation term has run, (N, terms); (N, 0) without a clock."""
     just_reset: torch.Tensor
     """Worlds at the first step of an episode, (N,) bool."""
     history: torch.Tensor
@@ -127,19 +135,21 @@ class EnvironmentMemory:
         num_envs: int,
         *,
         joints: int,
+        actions: int,
         feet: int,
         history: int,
         frame: int,
         terms: int,
         ends: int,
         metrics: int,
+        clocks: int = 0,
         device: torch.device | str,
     ) -> EnvironmentMemory:
         """Return zeros of the right shapes."""
         numbers = partial(torch.zeros, device=device)
         counts = partial(numbers, dtype=torch.int64)
         flags = partial(numbers, num_envs, dtype=torch.bool)
-        widths = (None, 2, None, 2, None, joints, joints, joints, joints, joints, feet, terms, None)
+        widths = (None, 2, None, 2, None, actions, actions, joints, joints, joints, feet, feet, feet, terms, None)
         episode, columns = _block(numbers, num_envs, names=EPISODE, widths=widths)
         sums, totals = _block(numbers, names=SUMS, widths=(terms, None, ends, metrics, None))
         return cls(
@@ -157,6 +167,7 @@ class EnvironmentMemory:
             command_steps=counts(num_envs),
             command_extreme=flags(),
             holds_heading=flags(),
+            clocks=numbers(num_envs, clocks),
             just_reset=flags(),
             history=numbers(num_envs, history, frame),
             push_phase=counts(num_envs),
@@ -179,11 +190,15 @@ class EnvironmentMemory:
         self.joint_velocity.copy_(inputs.joint_velocity)
         self.joint_torque.copy_(inputs.joint_torque)
         self.foot_force.copy_(inputs.state.foot_contact_force_w.norm(dim=-1))
+        if inputs.feet is not None:
+            self.foot_air_time.copy_(inputs.feet.air_time)
+            self.foot_contact_time.copy_(inputs.feet.contact_time)
 
     def begin_episode(self, worlds: torch.Tensor) -> None:
         """Clear the tensors of one episode in the masked worlds, (N,) bool."""
         self.episode.masked_fill_(worlds[:, None], 0.0)
         self.episode_length.masked_fill_(worlds, 0)
+        self.clocks.masked_fill_(worlds[:, None], 0.0)
         self.command_extreme.masked_fill_(worlds, False)
         self.just_reset.copy_(worlds)
 

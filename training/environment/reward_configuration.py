@@ -19,6 +19,10 @@ _VERTICAL_VELOCITY = Ramp(start=-2.0, end=0.0, begin=0.0, until=0.1)
 _BASE_HEIGHT = Ramp(start=-1.0, end=-10.0, begin=0.0, until=0.2)
 
 
+FOOT_TERMS = ("foot_tilt", "foot_slip", "feet_apart", "air_time", "clock_height", "clock_contact")
+"""Terms that are about the steps of the feet (``feet.FootInputs``)."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class OwnTerm:
     """A function of one's own."""
@@ -35,6 +39,21 @@ class OwnReward(OwnTerm):
 
     weight: Ramp | float
     """Weight per second; penalties are negative."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PoseWeights:
+    """Weight of each joint in ``pose`` by its role, which ``robots.anatomy`` tells from the model."""
+
+    hip_roll: float = 1.0
+    hip_pitch: float = 0.0
+    hip_yaw: float = 1.0
+    knee: float = 0.0
+    ankle: float = 0.0
+    waist: float = 1.0
+    arm: float = 1.0
+    """Shoulders, elbows, wrists and hands."""
+    head: float = 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,6 +108,24 @@ class RewardWeights:
     """Absolute deviation from the standing pose [rad] under the zero command."""
     termination: float = 0.0
     """Falls, counted once and not per second."""
+    alive: float = 0.0
+    """Not falling."""
+    orientation: float = 0.0
+    """Squared horizontal part of gravity in the base's frame."""
+    pose: float = 0.0
+    """Squared deviations from the standing pose [rad²], weighted by role (``pose_weights``)."""
+    foot_tilt: float = 0.0
+    """Squared sine of the angle of each sole to the horizontal."""
+    foot_slip: float = 0.0
+    """Squared horizontal speed of feet that carry [m²/s²]."""
+    feet_apart: float = 0.0
+    """Distance that a left foot is too close to its right counterpart [m] (``least_apart``)."""
+    air_time: float = 0.0
+    """Time for which half of the feet have carried alone, up to ``longest_step`` [s], under a command to move."""
+    clock_height: float = 0.0
+    """Tracking of the clearance that the gait clock asks for (``environment.gait``)."""
+    clock_contact: float = 0.0
+    """Share of the feet that carry or swing as the gait clock asks."""
     own: tuple[OwnReward, ...] = ()
     """Terms of one's own."""
 
@@ -116,6 +153,13 @@ class RewardShapes:
     """Length and width of the area below the base [m]: the base's height is measured from the mean of the height scan's points in it."""
     foot_height_scale: Positive = 0.025
     """Foot regulation fades with foot height over this share of ``base_height_target``."""
+    pose_weights: PoseWeights = PoseWeights()
+    least_apart: Extent = 0.15
+    """Distance between left and right feet, across the heading, that ``feet_apart`` asks for [m]."""
+    longest_step: Positive = 0.4
+    """Time on one foot up to which ``air_time`` grows [s]."""
+    clock_sigma: Positive = 0.008
+    """Width of ``clock_height``, exp(-error²/sigma) [m²]."""
     foot_height_over: Literal["foot", "base"] = "foot"
     """Ground that foot height is measured from: ``foot`` (below that foot) or ``base`` (mean below the trunk)."""
 
@@ -129,6 +173,8 @@ class RewardLimits:
 
     collision_force: float = 0.1
     """Contact force from which a thigh, a calf or the base counts as touching [N]."""
+    foot_contact_force: Positive = 5.0
+    """Contact force from which a foot carries [N]."""
     soft_limit: Share = 0.9
     """Share of a joint's range, about its middle, that is free of the joint-limit penalty."""
     soft_speed_limit: Share = 0.9

@@ -12,6 +12,7 @@ import torch
 
 from ...robots.rotation import projected_gravity
 from ..configuration import Ramp
+from .gait_rewards import GAIT_TERMS
 from .own_terms import resolve_own
 from .reward_configuration import RewardWeights
 from .schedules import RampTable
@@ -189,6 +190,7 @@ REWARD_TERMS: Mapping[str, RewardTerm] = {
         torque_change,
         stand_still,
         termination,
+        *GAIT_TERMS,
     )
 }
 """All terms by the names of their weights in ``RewardWeights``, which adds those of one's own."""

@@ -81,7 +81,7 @@ class EnvironmentStep:
         seen, terrain, period = configuration.observations, configuration.terrain, configuration.physics.control_period
         self.max_episode_length = round(configuration.episode_length / period)
         self.default_pose = torch.tensor(robot.default_joint_position, device=device)
-        self.action = torch.zeros(num_envs, joints, device=device)
+        self.action = torch.zeros(num_envs, contract.num_joints, device=device)
         self.scan = scan_pattern(seen.scan_length, seen.scan_width, seen.scan_spacing, device)
         reach = math.hypot(seen.scan_length, seen.scan_width) / 2
         edge = terrain.leave_distance or terrain.promotion_distance
@@ -124,16 +124,20 @@ class EnvironmentStep:
         self.memory = EnvironmentMemory.allocate(
             num_envs,
             joints=joints,
+            actions=contract.num_joints,
             feet=len(robot.foot_names),
             history=seen.history_length,
             frame=contract.frame_width,
             terms=len(self.rewards.names),
             ends=len(self.terminations.names),
             metrics=len(METRICS),
+            clocks=len(contract.observation) if configuration.gait.period else 0,
             device=device,
         )
         ground = Ground(rasters, self.memory.terrain_index, delay=seen.scan_delay)
         self._builder = ObservationBuilder(contract, robot, num_envs, device, ground)
+        if configuration.gait.period:
+            self._builder.clocks = self.memory.clocks
         self.observer = Observer(
             seen,
             contract=contract,

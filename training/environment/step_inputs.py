@@ -34,6 +34,28 @@ def static_inputs(state: PhysicsState) -> PhysicsState:
     return PhysicsState(**{name: v.float() if v.is_floating_point() else v for name, v in values.items()})
 
 
+@dataclass(frozen=True, kw_only=True)
+class FootInputs:
+    """State of the feet after a control step, in the order of ``foot_names``. N worlds, F feet."""
+
+    contact: torch.Tensor
+    """Feet that carry more than ``RewardLimits.foot_contact_force``, (N, F) bool."""
+    air_time: torch.Tensor
+    """Time since a foot left the ground [s], zero in contact, (N, F)."""
+    contact_time: torch.Tensor
+    """Time since a foot touched the ground [s], zero in the air, (N, F)."""
+    clearance: torch.Tensor
+    """Height of the foot's centre over the ground below it, less that of a standing foot [m], (N, F)."""
+    tilt: torch.Tensor
+    """Squared sine of the angle between the sole, level in the standing pose, and the horizontal plane, (N, F)."""
+    apart: torch.Tensor
+    """Smallest distance of a left foot from its right counterpart, to the left of the heading [m], (N,); negative for crossed legs."""
+    swing: torch.Tensor
+    """Feet that the gait clock wants in the air, (N, F) bool; none without a clock."""
+    wanted_clearance: torch.Tensor
+    """Clearance that the gait clock asks for [m], (N, F)."""
+
+
 @dataclass(kw_only=True)
 class StepInputs:
     """State after a control step, before any reset. N worlds, J joints, F feet."""
@@ -118,5 +140,15 @@ class StepInputs:
     """Episodes that end as a failure, (N,) bool; the terminations write it, so that rewards can read it."""
     base_height_target: float
     """[m]."""
+    feet: FootInputs | None = None
+    """More about the feet, where a reward with a weight asks for it."""
+    pose_weight: torch.Tensor | None = None
+    """Weight of each joint in the reward ``pose``, (J,), where that has a weight."""
+    least_apart: float = 0.0
+    """[m]; as the next two, of ``RewardShapes``."""
+    longest_step: float = 1.0
+    """[s]."""
+    clock_sigma: float = 1.0
+    """[m²]."""
     foot_height_length: float
     """Height over which foot regulation fades by a factor e [m]."""

@@ -15,7 +15,10 @@ from ...terrains.height_scan import HeightRasters, heading_and_upright, place_pa
 from ..configuration import ConfigurationError
 from .configuration import EnvironmentConfiguration
 from .curriculum import TrainingPalette
+from .feet import FootReader
+from .gait_rewards import pose_weights
 from .memory import EnvironmentMemory
+from .reward_configuration import FOOT_TERMS
 from .step_inputs import StepInputs
 
 
@@ -66,9 +69,14 @@ class StepReader:
             pairs = [(i, mirror.joint[i], mirror.sign[i]) for i in plan.abduction if i < mirror.joint[i]]
         self._hip_pairs = self._indices([pair[:2] for pair in pairs]).view(-1, 2)
         self._hip_signs = torch.tensor([sign for *_, sign in pairs], device=device)
+        r = self._settings
+        self._pose_weight = pose_weights(r.pose_weights, robot, device) if r.pose else None
+        self._feet = None
+        if any(getattr(r, name) for name in FOOT_TERMS):
+            self._feet = FootReader(r, configuration.gait, robot=robot, period=self._period, device=device)
         self._base = robot.collision_bodies.index(robot.base_body)
         self._limbs = self._indices(plan.limb_bodies)
-        r, tiles = self._settings, palette.tiles
+        tiles = palette.tiles
         sigma = torch.tensor([tile.sigma for tile in tiles], device=device)[kind]
         self._sigma_growth = sigma - r.tracking_sigma
         levels = torch.arange(1, palette.num_levels + 1, device=device)
@@ -130,6 +138,7 @@ class StepReader:
         below_feet = (
             ground[:, len(self._trunk_points) :] if settings.foot_height_over == "foot" else below_base[:, None]
         )
+        foot_height = state.foot_position_w[..., 2] - below_feet
         return StepInputs(
             base_linear_velocity_b=velocity_b,
             base_angular_velocity_b=state.base_angular_velocity_b,
@@ -152,7 +161,7 @@ class StepReader:
             action=action,
             previous_action=memory.action,
             second_previous_action=memory.previous_action,
-            foot_height=state.foot_position_w[..., 2] - below_feet,
+            foot_height=foot_height,
             foot_velocity_w=state.foot_velocity_w,
             touching_bodies=(touching[:, self._limbs] > settings.collision_force).sum(dim=1).float(),
             base_touching=(touching[:, self._base] > settings.collision_force).float(),
@@ -170,6 +179,11 @@ class StepReader:
             period=self._period,
             state=state,
             failed=diverged,
+            feet=None if self._feet is None else self._feet(state, memory, foot_height, heading_xy),
+            pose_weight=self._pose_weight,
+            least_apart=settings.least_apart,
+            longest_step=settings.longest_step,
+            clock_sigma=settings.clock_sigma,
             base_height_target=settings.base_height_target,
             foot_height_length=settings.foot_height_scale * settings.base_height_target,
         )

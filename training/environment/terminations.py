@@ -43,6 +43,12 @@ def tilt(inputs: StepInputs, settings: TerminationConfiguration) -> torch.Tensor
     return inputs.upright < math.cos(settings.tilt)
 
 
+def low(inputs: StepInputs, settings: TerminationConfiguration) -> torch.Tensor:
+    """Return True where the base is lower than ``low`` metres over the ground."""
+    assert settings.low is not None
+    return inputs.base_height < settings.low
+
+
 def stuck(inputs: StepInputs, settings: TerminationConfiguration) -> torch.Tensor:
     """Return True where nearly all of the commanded speed has been missing for about ``stuck`` seconds: an average that began at 0 has
     come to ``STUCK_SHORTFALL`` after this much time at a standstill.
@@ -59,7 +65,7 @@ def diverged(inputs: StepInputs, settings: TerminationConfiguration) -> torch.Te
 
 
 _TIME_OUTS = (time_out, left_tile)
-TERMINATIONS: dict[str, Rule] = {f.__name__: f for f in (*_TIME_OUTS, trunk_contact, tilt, stuck, diverged)}
+TERMINATIONS: dict[str, Rule] = {f.__name__: f for f in (*_TIME_OUTS, trunk_contact, tilt, low, stuck, diverged)}
 """All rules by name: time-outs, then failures. A rule is left out where its setting, of the same name, is None; ``own`` adds more."""
 
 

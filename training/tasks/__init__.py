@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from types import MappingProxyType
@@ -27,6 +27,7 @@ from ..environment.configuration import (
 from ..environment.reward_configuration import RewardConfiguration
 from ..environment.terrain_configuration import FLAT_TILE, TerrainConfiguration
 from ..overrides import TaskError, apply_overrides
+from . import biped
 from .scaling import scaled
 
 
@@ -285,16 +286,43 @@ def _sprint() -> Task:
     return Task(name="go2-sprint", title=title, environment=environment, training=training)
 
 
+def _on_two_legs() -> Iterator[Task]:
+    """Yield the tasks of the G1, each with the paper's method and with DreamWaQ."""
+    for ending, method, network, means in (
+        ("", "cts", NetworkConfiguration(), "Mixture-of-Experts student"),
+        ("-dreamwaq", "dreamwaq", _DREAMWAQ, "variational estimator (DreamWaQ)"),
+    ):
+        for ground, where, settings in (
+            ("walk", "level ground", biped.walk(_LEVEL_GROUND, method, network)),
+            ("rough", "all terrains", biped.rough(method, network)),
+        ):
+            environment, training = settings
+            name = f"g1-{ground}{ending}"
+            yield Task(
+                name=name,
+                title=f"Unitree G1 on {where}, {means}",
+                environment=environment,
+                training=replace(training, run=replace(training.run, experiment=name.replace("-", "_"))),
+            )
+
+
 TASKS: Mapping[str, Task] = MappingProxyType(
-    {task.name: task for task in (*(_on_all_terrains(*row) for row in _METHODS), _flat(), _sprint(), _toy())}
+    {
+        task.name: task
+        for task in (*(_on_all_terrains(*row) for row in _METHODS), _flat(), _sprint(), _toy(), *_on_two_legs())
+    }
 )
 """All tasks by name."""
 
-_ROUGH = {"": "go2-moe-cts", **{f"-{name.removeprefix('go2-')}": name for name, *_ in _METHODS}}
+_ROUGH = {f"-{name.removeprefix('go2-')}": name for name, *_ in _METHODS}
 GROUNDS: Mapping[str, Mapping[str, str]] = MappingProxyType(
     {
+        "rough": {"quadruped": "go2-moe-cts", "biped": "g1-rough"},
         **{f"rough{method}": {"quadruped": name} for method, name in _ROUGH.items()},
-        **{name: {"quadruped": "go2-flat"} for name in ("walk", "flat")},
+        "rough-moe-cts": {"quadruped": "go2-moe-cts", "biped": "g1-rough"},
+        "rough-dreamwaq": {"quadruped": "go2-dreamwaq", "biped": "g1-rough-dreamwaq"},
+        **{name: {"quadruped": "go2-flat", "biped": "g1-walk"} for name in ("walk", "flat")},
+        "walk-dreamwaq": {"biped": "g1-walk-dreamwaq"},
         "sprint": {"quadruped": "go2-sprint"},
     }
 )
@@ -311,11 +339,12 @@ def settled_name(name: str, robot: str | None = None) -> str:
     """
     if name not in GROUNDS:
         return name
-    plan = _plan(robot) if robot is not None else "quadruped"
+    robot = robot or "go2"
+    plan = _plan(robot)
     if plan not in GROUNDS[name]:
         fits = [each for each, tasks in GROUNDS.items() if plan in tasks]
         raise TaskError(
-            f"task '{name}' is not made for robot '{load_robot(str(robot)).name}', {WORDS[plan]}; "
+            f"task '{name}' is not made for robot '{load_robot(robot).name}', {WORDS[plan]}; "
             f"{'tasks for it are: ' + ', '.join(fits) if fits else 'no task is'}"
         )
     return GROUNDS[name][plan]

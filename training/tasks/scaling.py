@@ -11,6 +11,7 @@ from ...robots import Robot, load_robot
 from ...robots.body_plan import body_plan
 from ..configuration import Ramp, Range, TrainingConfiguration
 from ..environment.configuration import CommandStage, EnvironmentConfiguration
+from ..environment.reward_configuration import FOOT_TERMS
 
 Triple = tuple[float, float, float]
 
@@ -46,7 +47,8 @@ def ratios(robot: Robot, reference: Robot) -> Ratios:
     return Ratios(
         length=mine.leg_length / its.leg_length,
         height=mine.stretched_height / its.stretched_height,
-        stance=(mine.stance[0] / its.stance[0], mine.stance[1] / its.stance[1]),
+        # feet side by side make a rectangle without length
+        stance=(_over(mine.stance[0], its.stance[0]), _over(mine.stance[1], its.stance[1])),
         mass=mine.mass / its.mass,
         action=_action_scale(robot) / _action_scale(reference),
         speed=(forward, lateral, yaw),
@@ -58,10 +60,10 @@ def scaled(
 ) -> tuple[EnvironmentConfiguration, TrainingConfiguration]:
     """Return a task's settings for another robot, which explores by the same angles, in an experiment that is named for it.
 
-    Scaled are the height of the base with the legs' reach; the place to start on with the stance; masses that are added; penalties on
-    torque and power with the robot's load; penalties on actions with the angle that an action is; contact forces that teacher
-    and critic see; and commands with the robot's own limits. Terrain is not: every robot meets the ground that the gauge has. The
-    parameter set is the robot's default one where it has none of the name that the task asks for.
+    Scaled are the height of the base with the legs' reach; the place to start on with the stance; steps with legs and stance; masses
+    that are added; penalties on torque and power with the robot's load; penalties on actions with the angle that an action is; contact
+    forces that teacher and critic see; and commands with the robot's own limits. Terrain is not: every robot meets the ground that the
+    gauge has. The parameter set is the robot's default one where it has none of the name that the task asks for.
 
     Args:
         environment: settings for ``environment.robot``.
@@ -83,9 +85,32 @@ def scaled(
     return _scaled_environment(environment, robot, source, by), learning
 
 
+def _over(mine: float, its: float) -> float:
+    return mine / its if its > 0.01 else 1.0
+
+
+def _with_steps(environment: EnvironmentConfiguration, by: Ratios) -> EnvironmentConfiguration:
+    """Return the settings with steps of the robot's size, where the task rewards steps: a longer leg swings more slowly."""
+    rewards, gait, time = environment.rewards, environment.gait, by.length**0.5
+    if not any(getattr(rewards, name) for name in FOOT_TERMS):
+        return environment
+    return replace(
+        environment,
+        rewards=replace(
+            rewards,
+            least_apart=rewards.least_apart * by.stance[1],
+            longest_step=rewards.longest_step * time,
+            clock_sigma=rewards.clock_sigma * by.length**2,
+            foot_contact_force=rewards.foot_contact_force * by.mass,
+        ),
+        gait=replace(gait, period=gait.period and gait.period * time, swing_height=gait.swing_height * by.length),
+    )
+
+
 def _scaled_environment(
     environment: EnvironmentConfiguration, robot: Robot, source: str, by: Ratios
 ) -> EnvironmentConfiguration:
+    environment = _with_steps(environment, by)
     rewards, randomization, commands = environment.rewards, environment.randomization, environment.commands
     parameters, (length, width) = environment.joints.parameters, environment.reset.footprint
     return replace(
@@ -111,6 +136,9 @@ def _scaled_environment(
             trunk_area=_scaled(rewards.trunk_area, by.length),
             sigma_linear_range=_scaled(rewards.sigma_linear_range, by.speed[0]),
             sigma_yaw_range=_scaled(rewards.sigma_yaw_range, by.speed[2]),
+        ),
+        termination=replace(
+            environment.termination, low=environment.termination.low and environment.termination.low * by.height
         ),
         reset=replace(environment.reset, footprint=(length * by.stance[0], width * by.stance[1])),
         randomization=replace(
