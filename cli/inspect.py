@@ -106,6 +106,10 @@ def contract_table(contract: PolicyContract) -> Table:
         "action clip": "none" if contract.action_clip is None else f"{contract.action_clip:g}",
         "stiffness [N·m/rad]": _numbers(contract.stiffness),
         "damping [N·m·s/rad]": _numbers(contract.damping),
+        "held [rad; N·m/rad; N·m·s/rad]": ", ".join(
+            f"{h.name} {h.position:g}; {h.stiffness:g}; {h.damping:g}" for h in contract.held
+        )
+        or None,
         "control period [s]": f"{contract.control_period:g}",
         "observation": ", ".join(f"{t.name} × {_numbers(t.scale)}" for t in contract.observation),
         "height scan": next((_scan(t) for t in contract.observation if t.name == HEIGHT_SCAN), None),

@@ -66,6 +66,10 @@ def joint_parameters(suite: Suite, robot: Robot, contract: PolicyContract) -> Jo
     for policy_joint, robot_joint in enumerate(check_robot(contract, robot)):
         stiffness[robot_joint] = contract.stiffness[policy_joint]
         damping[robot_joint] = contract.damping[policy_joint]
+    for joint in contract.held:
+        if joint.name in robot.joint_names:
+            place = robot.joint_names.index(joint.name)
+            stiffness[place], damping[place] = joint.stiffness, joint.damping
     return own.commanded(stiffness, damping)
 
 

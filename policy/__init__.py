@@ -3,13 +3,13 @@
 Only the contract is imported here, so that reading one does not wait for torch.
 """
 
+from .comparing import difference
 from .contract import (
     ContractError,
     History,
     ObservationTerm,
     PolicyContract,
     check_robot,
-    difference,
     standard_contract,
 )
 

@@ -18,7 +18,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from ..files.parsing import LARGEST, Text, build, check_fields, parse_json, shown
-from ..robots.base import Angle, Damping, Robot, Speed, Stiffness
+from ..robots.base import Angle, Damping, HeldJoint, Robot, Speed, Stiffness
 from .observation_table import HEIGHT_SCAN, OBSERVATIONS, STANDARD, ObservationError, observation
 
 SCHEMA_VERSION: Literal[1] = 1
@@ -46,7 +46,7 @@ class ContractError(ValueError):
 _MOST = 1000
 """Joints."""
 _LATER = frozenset(
-    {"action_offset", "layout", "memory", "encoder", "velocity_joints"}
+    {"action_offset", "layout", "memory", "encoder", "velocity_joints", "held"}
     | {"reference", "values", "period", "offsets", "waves", "at_rest"}
     | {"size", "spacing", "fastest"}
 )
@@ -226,6 +226,9 @@ class PolicyContract:
     """Origin of the policy (training run, file, adapter); not part of the hash."""
     velocity_joints: tuple[Text, ...] = ()
     """Joints with targets of velocity [rad/s] instead of angle, as wheels have: torque = damping · (target − speed)."""
+    held: Annotated[tuple[HeldJoint, ...], Field(max_length=_MOST)] = ()
+    """Joints that the policy does not drive, in any order: their motors hold them at an angle with gains of their own. Joints that
+    the robot's description holds need no entry, and those that the robot lacks do no harm."""
     schema_version: Literal[1] = SCHEMA_VERSION
 
     def __post_init__(self) -> None:
@@ -237,6 +240,9 @@ class PolicyContract:
             entries = getattr(self, name)
             if entries is not None and len(entries) != joints:
                 raise ContractError(f"contract: {name} has {len(entries)} entries; {joints} are needed")
+        twice = [joint.name for joint in self.held if [*names, *(h.name for h in self.held)].count(joint.name) > 1]
+        if twice:
+            raise ContractError(f"contract: held names {shown(twice[0])}, which is in joint_names too or held twice")
         for joint in self.velocity_joints:
             if joint not in names:
                 raise ContractError(f"contract: velocity_joints names {shown(joint)}, which is none of joint_names")
@@ -376,19 +382,23 @@ def check_robot(contract: PolicyContract, robot: Robot) -> tuple[int, ...]:
         For each joint of the policy, its index in the robot's joint order.
 
     Raises:
-        ContractError: another robot, or joint names that are not, in some order, those of the robot or of one of its variants.
+        ContractError: another robot, or joint names that are not, in some order, those of the robot or of one of its variants, and that
+            do not make them up with the joints that the policy holds.
     """
     if contract.robot != robot.name:
         raise ContractError(
             f"the policy is for robot '{contract.robot}', not for '{robot.name}'; leave --robot out, or give a "
             f"policy for '{robot.name}'"
         )
-    if robot.driving(contract.joint_names) is None:
+    held = [joint.name for joint in held_joints(contract, robot)]
+    if sorted([*contract.joint_names, *held]) != sorted(robot.joint_names):
         names = {name: len(each.driven_joints) for name, each in (robot.variants or {}).items()}
         variants = "".join(f", or the {count} of its variant '{name}'" for name, count in names.items())
+        also = f" and holds {', '.join(held)}" if held else ""
         raise ContractError(
             f"the policy's joints are not those of robot '{robot.name}': "
-            f"the policy has {', '.join(contract.joint_names)}; the robot has {', '.join(robot.joint_names)}{variants}"
+            f"the policy has {', '.join(contract.joint_names)}{also}; the robot has {', '.join(robot.joint_names)}{variants}; joints "
+            "that the policy does not drive belong into held of its contract"
         )
     wheels = set(robot.velocity_joints or ()) & set(contract.joint_names)
     if set(contract.velocity_joints) != wheels:
@@ -398,6 +408,16 @@ def check_robot(contract: PolicyContract, robot: Robot) -> tuple[int, ...]:
             "the policy's contract"
         )
     return tuple(robot.joint_names.index(n) for n in contract.joint_names)
+
+
+def held_joints(contract: PolicyContract, robot: Robot) -> tuple[HeldJoint, ...]:
+    """Return the joints that are held while a policy plays: those of its contract, and those that the robot's variant holds else.
+
+    Joints of the contract that the robot lacks are left out: a G1 of 12 joints has rigid arms.
+    """
+    own = [joint for joint in contract.held if joint.name in robot.joint_names]
+    variant, named = robot.driving(contract.joint_names), {joint.name for joint in own}
+    return (*own, *(joint for joint in (variant.held if variant else ()) if joint.name not in named))
 
 
 def reordered(contract: PolicyContract, joint_names: Sequence[str]) -> PolicyContract:
@@ -415,39 +435,6 @@ def reordered(contract: PolicyContract, joint_names: Sequence[str]) -> PolicyCon
     )
     values = {name: moved(getattr(contract, name)) for name in PER_JOINT}
     return replace(contract, joint_names=tuple(joint_names), observation=terms, **values)
-
-
-def other_width(contract: PolicyContract, width: int) -> str:
-    """Return a contract's observation width as part of a sentence on a network with another width, and what would fit."""
-    frames, rest = divmod(width, contract.frame_width)
-    fits = f"; {frames} frames are {width}: history = {{ length = {frames} }}" if frames and not rest else ""
-    return (
-        f"but its contract's observation has {contract.observation_width} "
-        f"({', '.join(f'{t.name} {w}' for t, w in zip(contract.observation, contract.term_widths, strict=True))}){fits}"
-    )
-
-
-def difference(a: PolicyContract, b: PolicyContract) -> str:
-    """Return two contracts' differences but for provenance, lines ``field: value in a -> value in b``; empty where they are equal."""
-    left, right = _flat(a), _flat(b)
-    lines = [
-        f"{n}: {left.get(n, 'absent')} -> {right.get(n, 'absent')}" for n in left | right if left.get(n) != right.get(n)
-    ]
-    return "\n".join(lines)
-
-
-def _flat(contract: PolicyContract) -> dict[str, str]:
-    rows: dict[str, str] = {}
-    for name, value in contract.to_dict().items():
-        if name == "observation":
-            rows["observation"] = ", ".join(t["name"] for t in value)
-            for term in value:
-                rows.update({f"observation.{term['name']}.{k}": repr(v) for k, v in term.items() if k != "name"})
-        elif name == "history":
-            rows.update({f"history.{key}": repr(entry) for key, entry in value.items()})
-        elif name != "provenance":
-            rows[name] = repr(value)
-    return rows
 
 
 def standard_contract(

@@ -37,7 +37,8 @@ from torch import nn
 from ..files.parsing import shown
 from ..files.writing import make_folder, replacing
 from .base import Policy, PolicyError, PolicySession, check_observation, checked_action
-from .contract import ContractError, PolicyContract, other_width
+from .comparing import other_width
+from .contract import ContractError, PolicyContract
 from .foreign.fence.archive import packed, read_archive
 from .foreign.fence.pickles import REBUILD_TENSOR, check_tensors, read_pickle
 from .networks.architectures import ARCHITECTURES

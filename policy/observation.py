@@ -8,7 +8,7 @@ import torch
 
 from ..backends.base import PhysicsState
 from ..robots.base import Robot
-from .contract import RESTING, ContractError, ObservationTerm, PolicyContract, check_robot
+from .contract import RESTING, ContractError, ObservationTerm, PolicyContract, check_robot, held_joints
 from .ground import Ground, HeightScan
 from .observation_table import HEIGHT_SCAN, OBSERVATIONS, Observation, observation
 
@@ -50,13 +50,11 @@ class ObservationBuilder:
         every = tuple(range(robot.num_joints))
         self._robot_joint = None if index == every else self._tensor(index, torch.int64)
         # where each of the robot's joints finds its target: among those of the policy, or behind them among those held
-        held = [j for j in every if j not in index]
-        found = [index.index(j) if j in index else len(index) + held.index(j) for j in every]
+        held = held_joints(contract, robot)
+        listed = (*index, *(robot.joint_names.index(joint.name) for joint in held))
+        found = tuple(listed.index(j) for j in every)
         self._policy_joint = None if index == every else self._tensor(found, torch.int64)
-        variant = robot.driving(contract.joint_names)
-        assert variant is not None  # check_robot has found it
-        pose = self._tensor([variant.default_joint_position[j] for j in held])
-        self._held = pose.expand(num_episodes, -1) if held else None
+        self._held = self._tensor([joint.position for joint in held]).expand(num_episodes, -1) if held else None
         self._default = self._tensor(contract.default_joint_position)
         self._offset = self._tensor(contract.action_offset or contract.default_joint_position)
         self._action_scale = self._tensor(contract.action_scale)
@@ -199,7 +197,7 @@ class ObservationBuilder:
     def targets(self, action: torch.Tensor) -> torch.Tensor:
         """Return all joints' targets [rad, rad/s] in the robot's order, (N, J), of raw actions in the policy's order; NaN stays NaN.
 
-        Joints that the policy does not drive are held at the pose of the robot's variant.
+        Joints that the policy does not drive are held at the pose of its contract, or of the robot's variant.
         """
         if self.contract.action_clip is not None:
             action = torch.clamp(action, -self.contract.action_clip, self.contract.action_clip)

@@ -98,12 +98,12 @@ class Variant:
 class HeldJoint:
     """A joint that no policy drives: its motor holds it at an angle."""
 
-    name: str
-    position: float
+    name: Text
+    position: Angle
     """[rad]."""
-    stiffness: float
+    stiffness: Stiffness
     """[N·m/rad]."""
-    damping: float
+    damping: Damping
     """[N·m·s/rad]."""
 
 

@@ -15,6 +15,8 @@ _LONG = 2.0
 """Smallest length over width of a shape that counts as a shank."""
 _ALONG = 0.7
 """Smallest cosine between a shank's shape and the line from the knee to its end."""
+_UPRIGHT = 0.3
+"""Smallest cosine between a shank's shape and the vertical."""
 _WIDER = 1.25
 """Radius of a sphere at the end of a shape over that of what it covers: the sphere alone meets the ground."""
 _TIP = 0.1
@@ -51,6 +53,8 @@ def shank_end(model: mujoco.MjModel, data: mujoco.MjData, geom: int, knee: NDArr
         return None
     # in the shape's own frame; the end is the side further from the knee
     turn, place = data.geom_xmat[geom].reshape(3, 3), data.geom_xpos[geom]
+    if abs(turn[2, long]) < _UPRIGHT:
+        return None  # a sole
     from_knee = turn.T @ (knee - place)
     outwards = 1.0 if from_knee[long] < middle[long] else -1.0
     end = middle.copy()

@@ -22,7 +22,8 @@ import yaml
 from ...files.writing import make_folder, replacing, same_file
 from ...robots import Robot
 from ..base import PROBE_EPISODES, Policy, PolicyError
-from ..contract import HistoryOrder, ObservationTerm, PolicyContract, difference
+from ..comparing import difference
+from ..contract import HistoryOrder, ObservationTerm, PolicyContract
 from ..foreign.deploy_yaml import deploy_contract
 from ..foreign.fence.script import CONTRACT_FILE
 from ..loading import load_policy

@@ -163,6 +163,8 @@ history = {{ length = 1, order = "frame-major", start = "zeros" }}
 # layout = [{{ input = "obs", length = 1 }}, {{ input = "obs_history", length = 5 }}]
 # A second network that runs first, and whether its output stands before or behind the rest of the input:
 # encoder = {{ file = "adaptation_module.pt", latent = "last" }}
+# Joints that the policy does not drive, arms for example: their motors hold them.
+# held = [{{ name = "left_elbow_joint", position = 0.0, stiffness = 50.0, damping = 2.0 }}]
 # memory = [["h_in", "h_out"]]       # recurrent states of an ONNX file, where their names do not tell
 
 # The observation, term by term: scale times (value - reference), then clipped. Also known:

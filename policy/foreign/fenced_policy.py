@@ -11,7 +11,8 @@ from typing import Any
 import torch
 
 from ..base import Interface, PolicyError, PolicySession, check_observation
-from ..contract import PolicyContract, other_width
+from ..comparing import other_width
+from ..contract import PolicyContract
 from ..native import FilePolicy, ForeignFile
 from .fence.child import Child
 

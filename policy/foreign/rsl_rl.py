@@ -23,7 +23,8 @@ import torch
 from ...files.parsing import parse_yaml, read_text
 from ...robots.base import Robot
 from ..base import PolicyError
-from ..contract import ContractError, PolicyContract, other_width, standard_contract
+from ..comparing import other_width
+from ..contract import ContractError, PolicyContract, standard_contract
 from ..native import StoredNetwork
 from ..networks.layers import ACTIVATIONS
 

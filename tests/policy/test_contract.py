@@ -2,14 +2,13 @@ import json
 from dataclasses import replace
 
 import pytest
+from gaitgauge.policy.comparing import difference, other_width
 from gaitgauge.policy.contract import (
     ContractError,
     History,
     ObservationTerm,
     PolicyContract,
     check_robot,
-    difference,
-    other_width,
     standard_contract,
 )
 from gaitgauge.robots import load_robot

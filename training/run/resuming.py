@@ -11,7 +11,8 @@ from typing import Any
 import torch
 
 from ...files.parsing import edited, one_line, shown
-from ...policy.contract import PHYSICS, PolicyContract, difference
+from ...policy.comparing import difference
+from ...policy.contract import PHYSICS, PolicyContract
 from ...policy.finding import latest_checkpoint
 from ...policy.native import StoredNetwork
 from ...policy.networks.estimators import VELOCITY
