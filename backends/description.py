@@ -16,7 +16,7 @@ UNLIMITED = 1e5
 
 @dataclass(frozen=True, kw_only=True)
 class FootContact:
-    """What acts between each foot and the floor beside sliding friction. Arrays (F,)."""
+    """Contact of each foot with the floor beside sliding friction. Arrays (F,)."""
 
     dimension: ArrayLike
     """3 sliding, 4 with torsion, 6 with rolling."""

@@ -15,7 +15,7 @@ from .play_session import PlaySession
 from .scenery import COLLISION_GROUP, visual_model
 
 _BESIDE = 1.6
-"""Distance between robots whose ground is the same at both places [m]."""
+"""Distance between robots on the same ground [m]."""
 
 
 def geom_mesh(model: mujoco.MjModel, geom: int) -> trimesh.Trimesh | None:

@@ -37,7 +37,7 @@ _HELD = 6
 def film_failures(
     prepared: PreparedSearch, folder: Path, quality: Quality, progress: Callable[[float, str], None]
 ) -> dict[str, Any]:
-    """Film the gallery of a search that has ended, and note the films in its ``worst.json``, whose content is returned.
+    """Film the gallery of a search that has ended, and note the films in its ``worst.json``; return that file's content.
 
     Films that are there are not made again.
 

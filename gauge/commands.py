@@ -14,7 +14,7 @@ Command = tuple[float, float, float]
 
 @dataclass(frozen=True, kw_only=True)
 class Phase:
-    """What is commanded for a time."""
+    """A command for a time."""
 
     seconds: Annotated[float, Field(gt=0.0, le=600.0)]
     velocity: tuple[_Speed, _Speed, _Speed]

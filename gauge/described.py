@@ -25,7 +25,7 @@ _SLIDING, _TORSION = 3, 4
 
 @dataclass(frozen=True, kw_only=True)
 class Description:
-    """What a result says of policy, robot and physics, without a figure of the play."""
+    """Statements of a result on policy, robot and physics, without a figure of the play."""
 
     policy: PolicyName
     robot: str

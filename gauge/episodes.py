@@ -1,4 +1,4 @@
-"""What an episode is before it runs, and what is known of it afterwards."""
+"""Describe an episode before it runs, and its record afterwards."""
 
 from __future__ import annotations
 
@@ -55,11 +55,11 @@ class Episode:
 
 @dataclass(kw_only=True)
 class Record:
-    """What came of an episode."""
+    """Outcome of an episode."""
 
     episode: Episode
     success: bool | None = None
-    """Whether the target was reached; None where there was none."""
+    """True where the target was reached; None where there was none."""
     falls: int = 0
     fallen: tuple[tuple[int, int], ...] | None = None
     """Goal, index into ``episode.goals``, and sub-command of each fall; None in files that do not say."""
@@ -80,7 +80,7 @@ class Record:
     part_index: NDArray[np.int16] = field(default_factory=lambda: np.zeros(0, np.int16))
     """Sub-command of each sample, (T,)."""
     touching: NDArray[np.bool_] | None = None
-    """Whether parts of the robot touch each other in each sample, (T,); None in files that do not say."""
+    """True where parts of the robot touch each other in a sample, (T,); None in files that do not say."""
 
     def summary(self) -> dict[str, Any]:
         """One flat row without the samples."""

@@ -23,7 +23,7 @@ class Environment:
 
     @property
     def searched(self) -> bool:
-        """Whether the level is found by search."""
+        """True where the level is found by search."""
         return self.level is None
 
     @property

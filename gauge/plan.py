@@ -30,18 +30,18 @@ Records = Mapping[Episode, Record]
 
 @dataclass(frozen=True, kw_only=True)
 class PlanRules:
-    """What a plan depends on beside environment and records."""
+    """Inputs of a plan beside environment and records."""
 
     suite: Suite
     seeds: tuple[int, ...]
     """Seeds of the quality episodes."""
     quality: bool = True
-    """Whether quality is evaluated at the level, and not the level alone."""
+    """True where quality is evaluated at the level, False for the level alone."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Plan:
-    """What is known of an environment and what is to be played there."""
+    """State of an environment, and the episodes to be played there."""
 
     level: float | None
     """Level reached or given, None while searched for; 0 on flat ground, and where not even level 1 is passed. A whole number but
@@ -49,7 +49,7 @@ class Plan:
     passed: Mapping[int, bool] = field(default_factory=dict)
     """Outcomes of the levels that the search has asked for, in its order; empty while the trials of a curve are open."""
     counted: tuple[Episode, ...]
-    """Episodes of which the results consist, in order, as far as they are known."""
+    """Episodes of the results, in order, as far as they are known."""
     required: tuple[Episode, ...]
     """Those of them that have not ended."""
     possible: Mapping[Episode, float] = field(default_factory=dict)
@@ -135,9 +135,9 @@ class LevelTest:
     counted: Sequence[Episode]
     """Episodes of the rounds so far."""
     later: Sequence[Episode]
-    """Episodes of which another round may consist."""
+    """Episodes that another round may have."""
     passed: bool | None
-    """Whether the level is passed, as soon as that is certain."""
+    """True where the level is passed, False where it is failed, as soon as that is certain."""
     probability: float
     """How probable it is that the level is passed: 0 or 1 once that is certain."""
     goes_on: float
@@ -276,12 +276,12 @@ class EnvironmentResult(Environment):
 
     @property
     def searched(self) -> bool:
-        """Whether the level was found by search."""
+        """Return whether the level was found by search."""
         return self.search is not None
 
 
 def environment_result(environment: Environment, records: Records, rules: PlanRules) -> EnvironmentResult:
-    """What came of an environment of which all required episodes have ended."""
+    """Outcome of an environment after all its required episodes."""
     found = plan(environment, records, rules)
     counted = [records[episode] for episode in found.counted]
     return EnvironmentResult(

@@ -1,4 +1,4 @@
-"""What policies are called for people, and the folders that are named after them: short, and never two alike."""
+"""Name policies for people, and the folders that hold their results: short, and never two alike."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _LONGEST = 80
 _LONGEST_FOLDER = 120
 """Characters of the names of several policies in one folder's name."""
 _NOTHING = re.compile(r"policy|model|results|kept|exported|export|checkpoints|runs|\.*", re.IGNORECASE)
-"""Parts of a path that tell nothing of whose policy it is."""
+"""Parts of a path that do not tell policies apart."""
 _LITTLE = re.compile(r"best|last|(model|seed)?[-_]?\d+", re.IGNORECASE)
 """Parts that tell something only with the one before them."""
 

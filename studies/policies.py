@@ -20,7 +20,7 @@ from ..robots import Robot, RobotError, load_robot
 from .naming import distinct_names
 
 Watch = Callable[[int, int, str], None]
-"""Called before each turn of a study with the turn's number, their count, and whose it is."""
+"""Called before each turn of a study with the turn's number, the count of turns and the policy's name."""
 Refused = dict[str, str]
 """``what`` was asked for and cannot be done while the rest was, as the user named it, and the ``reason``, one sentence."""
 
@@ -90,7 +90,7 @@ def lost_policy(file: Path, names: Sequence[str]) -> str | None:
 
 
 def describe(label: str, loaded: Loaded) -> dict[str, Any]:
-    """What a result says of a policy, as plain data."""
+    """Return the statements of a result on a policy, as plain data."""
     policy = loaded.policy
     return {
         "label": label,

@@ -1,4 +1,4 @@
-"""What Drake does not do exactly; this module needs no Drake."""
+"""Declare the limits of Drake; this module needs no Drake."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What PhysX does not do exactly; this module needs no PhysX."""
+"""Declare the limits of PhysX; this module needs no PhysX."""
 
 from __future__ import annotations
 

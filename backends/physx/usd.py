@@ -69,7 +69,7 @@ class UsdText:
             self._add(f"{kind} {name.replace('__', ':')} = {text}")
 
     def settings(self, values: Mapping[str, str | bool | float | int]) -> None:
-        """Write attributes whose type follows from their value."""
+        """Write attributes; the type of each follows from its value."""
         for name, value in values.items():
             text = (
                 f'"{value}"' if isinstance(value, str) else str(int(value)) if isinstance(value, bool) else repr(value)

@@ -193,7 +193,7 @@ class PhysxWorld(World):
         return np.array(positions), np.array(velocities)
 
     def contacts(self) -> list[Contact]:
-        """See ``World.contacts``: points with their normal forces, then friction anchors, whose places differ."""
+        """See ``World.contacts``: points with their normal forces, then friction anchors at other places."""
         force, point, normal, separation, count, start = self._normal_data
         self._contact_binding.read_normal_contact_data(*self._normal_data)
         found = []

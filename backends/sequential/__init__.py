@@ -1,4 +1,4 @@
-"""What engines on the CPU share that hold one world in one object: the loop over worlds, the motor law, the readout."""
+"""Share the loop over worlds, the motor law and the readout among engines on the CPU that hold each world in an object."""
 
 from .backend import SequentialBackend
 from .robot import Link, RobotModel, Shape, read_robot

@@ -45,7 +45,7 @@ _NEEDED = {"foot_torsion": "foot_contact", "foot_softness": "foot_contact", "bas
 
 
 class SequentialBackend(PhysicsBackend):
-    """An engine on the CPU whose worlds are objects. A subclass declares its limits and builds a ``World``.
+    """An engine on the CPU with an object for each world. A subclass declares its limits and builds a ``World``.
 
     A world that cannot be stepped (a value that is not finite, an error of the engine) is ``diverged`` and stands still until
     its reset.

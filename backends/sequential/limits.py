@@ -24,7 +24,7 @@ HARD_CONTACTS: dict[str, Capability] = {
     "contact_forces": about("hard contacts: the impulse of a touchdown falls into one physics step"),
     "gpu": missing("one CPU core a process"),
 }
-"""What engines with hard contacts have in common."""
+"""Limits that engines with hard contacts share."""
 
 
 def declare(limits: Mapping[str, Capability]) -> dict[str, Capability]:

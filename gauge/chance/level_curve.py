@@ -33,10 +33,10 @@ class CurveSearch:
     """Number of seeds, from the first on, that count at each level, in the order in which the levels were asked for."""
     lowest: int
     highest: int
-    """Levels of which the crossing is known to be among, or one beside: those in between may count."""
+    """Levels that hold the crossing, or a neighbour of it: those in between may count."""
     goes_down: bool
     goes_up: bool
-    """Whether levels below, or above, may still count."""
+    """True where levels below, or above, may still count."""
     level: float | None
     """The expected level, once all trials that count have ended."""
 

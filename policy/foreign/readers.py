@@ -32,7 +32,7 @@ _NEAR = 0.02
 
 @dataclass(frozen=True, kw_only=True)
 class Facts:
-    """What a policy's file says of itself."""
+    """Statements of a policy's file on itself."""
 
     inputs: Sequence[str] = ()
     """Names of the inputs that take observations, where they have names."""

@@ -38,7 +38,7 @@ class KnownPolicy:
     contract: Mapping[str, Any]
     """A ``contract.toml``."""
     note: Text | None = None
-    """What its authors' files leave open."""
+    """Settings that its authors' files leave open."""
 
     @property
     def robot(self) -> str:

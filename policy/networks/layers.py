@@ -99,7 +99,7 @@ class EncoderNetwork(nn.Module):
 
 
 class Experts(nn.Module):
-    """Several experts as one shared trunk, whose last layer is a block of private features for each, and a linear head for each.
+    """Several experts as one shared trunk, with a block of private features for each in its last layer, and a linear head for each.
 
     State dict: ``trunk.<layer>.*``, ``head_weight`` (K, output, expert), ``head_bias`` (K, output), with K = 1 if the experts
     share one head.

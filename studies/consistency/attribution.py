@@ -34,10 +34,10 @@ class Factor:
     perturbation: float = 0.0
     """Relative change of the state at each reset, where there is no option; 0 for single precision all along."""
     fixed_buffers_only: bool = False
-    """Whether it means something only to engines that hold contacts in buffers of fixed size."""
+    """True where it matters only to engines that hold contacts in buffers of fixed size."""
 
     def applies(self, variant: Variant, suite: PhysicsOptions) -> bool:
-        """Whether switching it changes anything in an engine."""
+        """Return whether switching it changes anything in an engine."""
         if not self.option:
             return True
         if self.fixed_buffers_only and backend_class(variant.backend).capabilities()["gpu"].support is Support.NONE:
@@ -93,7 +93,7 @@ def effect_of_switch(
     Args:
         base: the engine as the suite has it.
         switched: the same engine with the factor switched.
-        others: records of the engines whose gap to ``base`` is to be explained, by label.
+        others: records by label of the engines that differ from ``base``.
         name: seeds the intervals' generators.
 
     Returns:

@@ -48,7 +48,7 @@ WALK_SHARE = 0.25
 _POINTS = 100
 """Points of a curve in the results, at most."""
 MARKS = (0.01, 0.1)
-"""Base distances [m] whose first excess is reported."""
+"""Distances of the base [m]; the time of the first excess of each is reported."""
 
 
 @dataclass(frozen=True, kw_only=True)

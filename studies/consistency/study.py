@@ -63,7 +63,7 @@ class PreparedStudy:
 
     @property
     def design(self) -> Design:
-        """What is compared."""
+        """Return what is compared."""
         return Design(suite=self.suite, cells=tuple(self.cells), seeds=self.seeds, margin=self.request.margin)
 
     @property

@@ -29,7 +29,7 @@ class Variant:
     draw: int = 0
     """Number of the perturbation."""
     rounding: bool = False
-    """Whether joint targets are put off as much in every control step, as single precision would."""
+    """True where joint targets are late by the same time in every control step, as in single precision."""
 
     @property
     def label(self) -> str:
@@ -66,7 +66,7 @@ class Variant:
         return replace(changed, substeps=round(count))
 
     def worlds(self, scene: Scene, *, threads: int) -> PhysicsBackend:
-        """Build the worlds of a scene, whose physics options are the suite's.
+        """Build the worlds of a scene that has the suite's physics options.
 
         Raises:
             BackendError: the engine cannot do what the scene or the variant asks for.

@@ -165,7 +165,7 @@ class RetimedBackend(WrappedBackend):
 
 
 class _RetimedState(PhysicsState):
-    """A view of a state whose watches are counted in other substeps."""
+    """A view of a state with watches in other substeps."""
 
     def __init__(self, state: PhysicsState, ratio: float, substeps: int) -> None:
         self._state = state

@@ -1,4 +1,4 @@
-"""What else a policy may have been made for: contracts of the same input and output, each one likely mistake away.
+"""List contracts of the same input and output that a policy may have been made for, each one likely mistake away.
 
 The choices are those that published training codes and controllers really make; robots are known by their model alone, never
 by the names of their joints.
@@ -28,7 +28,7 @@ class Alternative:
     """A contract that a policy may have been made for."""
 
     kind: str
-    """What is otherwise, for example ``joint order``."""
+    """Name of the change, for example ``joint order``."""
     text: str
     """How it is otherwise."""
     contract: PolicyContract
@@ -99,7 +99,7 @@ def _plan(robot: Robot) -> BodyPlan | None:
 
 
 def _hips(contract: PolicyContract, robot: Robot) -> list[bool]:
-    """Whether each of the policy's joints swings a leg sideways."""
+    """Return whether each of the policy's joints swings a leg sideways."""
     plan = _plan(robot)
     sideways = {robot.joint_names[j] for j in plan.abduction} if plan else set()
     return [name in sideways for name in contract.joint_names]

@@ -38,7 +38,7 @@ _SPREAD = (0.25, 0.5)
 _ROUGH = 0.1
 """Mean change of a joint's torque from step to step, a share of its limit, at which smoothness has fallen to 1/e."""
 _SUITE = "gaitgauge-1"
-"""The suite whose contacts and motors' limits act."""
+"""Suite of the contacts and the motors' limits."""
 _TIMESTEP = 0.005
 """Length of a physics step [s], longer than the suite's: that changes scores by 0.004 at most and takes 10 s in place of 17."""
 
@@ -52,7 +52,7 @@ class Outcome:
     """How a policy did with one contract; shares and values from 0 to 1."""
 
     kind: str
-    """What is otherwise than described; empty for the contract as it is."""
+    """Change against the description; empty for the contract as it is."""
     text: str
     contract: PolicyContract
     survival: float

@@ -45,7 +45,7 @@ _BEGUN = 2
 
 @dataclass(frozen=True, kw_only=True)
 class Diagnosis:
-    """What a policy did as described, and with every likely other contract."""
+    """Outcomes of a policy as described, and with every likely other contract."""
 
     described: Outcome
     others: tuple[Outcome, ...]
@@ -62,7 +62,7 @@ class Diagnosis:
 
     @property
     def sound(self) -> bool:
-        """Whether the robot walks as described, and no other contract is clearly better."""
+        """Return whether the robot walks as described, and no other contract is clearly better."""
         return not self.mistakes and self.described.score >= SOUND
 
     @property

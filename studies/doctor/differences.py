@@ -1,4 +1,4 @@
-"""What distinguishes two contracts, as changes that can be made one by one."""
+"""Split the difference of two contracts into changes that can be made one by one."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Change:
     """One thing that is otherwise; changes of one pair of contracts may be made in any order."""
 
     kind: str
-    """What is otherwise, in the words of ``alternatives``."""
+    """Name of the change, in the words of ``alternatives``."""
     text: str
     """How it becomes."""
     apply: Apply

@@ -18,7 +18,7 @@ class JuryError(ValueError):
 
 @dataclass(frozen=True, kw_only=True)
 class Part:
-    """What every engine plays: a suite's goals at fixed levels."""
+    """A suite's goals at fixed levels, which every engine plays."""
 
     suite: str
     grounds: tuple[tuple[str, int], ...]

@@ -30,7 +30,7 @@ class Separation:
     recall: tuple[float, ...]
     """The share of each class."""
     chance: float
-    """What guessing would give."""
+    """Accuracy of guessing."""
 
 
 def principal_components(points: Array, count: int = 2) -> tuple[Array, Array]:

@@ -30,7 +30,7 @@ from .request import LatentRequest
 from .separation import Separation, principal_components, separation
 
 PAIRS = {"terrains": "forward on every terrain", "commands": "every command on all terrains"}
-"""What is told apart, as in the paper's two figures."""
+"""Classes of the two figures, as in the paper."""
 STRIDES = 10
 """Notes that a mean is taken over: a second, in which a robot takes two to three strides."""
 

@@ -94,7 +94,7 @@ class Log:
 
 
 def make_log(name: str, robot: Robot, columns: Mapping[str, Any], *, notes: Sequence[str] = ()) -> Log:
-    """Check and clean a recording whose columns are already in the robot's order.
+    """Check and clean a recording with columns in the robot's order.
 
     Args:
         name: of the file, for sentences.

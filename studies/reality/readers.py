@@ -44,7 +44,7 @@ _Sign = Annotated[int, Field(ge=-1, le=1)]
 
 @dataclass(frozen=True, kw_only=True)
 class LogMap:
-    """What a file does not say about itself. Joint names may lack the ending ``_joint``."""
+    """Settings that a file does not hold. Joint names may lack the ending ``_joint``."""
 
     robot: Text | None = None
     """Robot's name or ``robot.toml``."""

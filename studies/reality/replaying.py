@@ -155,7 +155,7 @@ def _about(log: Log, logs: Sequence[Log], rows: list[dict[str, Any]]) -> dict[st
 
 
 def check_torque(log: Log) -> None:
-    """Refuse a log whose recorded torques follow other gains than those that it says were sent.
+    """Refuse a log if its recorded torques follow other gains than the gains that it states.
 
     Raises:
         LogError: the median over the joints of the acting share of kp is below 0.5 or above 1.6.

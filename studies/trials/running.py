@@ -59,7 +59,7 @@ class Pull:
 
 @dataclass(frozen=True, kw_only=True)
 class Trial:
-    """What came of one robot."""
+    """Outcome of one robot."""
 
     seed: int
     outcome: str

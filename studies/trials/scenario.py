@@ -184,9 +184,9 @@ class Scenario:
     repeats: Annotated[int, Field(ge=1, le=1000)] = 20
     """Robots, where no other number is asked for."""
     suite: Text = "gaitgauge-1"
-    """Suite whose physics, sensor noise and latency act."""
+    """Suite of the physics, sensor noise and latency."""
     torque_speed_limit: bool = True
-    """Whether the motors' torque falls with their speed, as a real one's does."""
+    """True where the motors' torque falls with their speed, as a real one's does."""
     ground: Ground = field(default_factory=Ground)
     start: Start = field(default_factory=Start)
     commands: Annotated[tuple[Leg, ...], Field(min_length=1, max_length=1000)]

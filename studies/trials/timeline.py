@@ -1,4 +1,4 @@
-"""What robots in a scenario are told at every control step."""
+"""Give the robots in a scenario their commands at every control step."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class Timeline:
 
     @property
     def over(self) -> torch.Tensor:
-        """Whether a robot's commands are over, (N,) bool."""
+        """Return whether a robot's commands are over, (N,) bool."""
         return self._phase >= self._last
 
     def _turn(self, state: PhysicsState) -> torch.Tensor:

@@ -27,7 +27,7 @@ from .running import Trial, run_scenario
 from .scenario import Scenario, ScenarioError, load_scenario, scenario_names
 
 MEASURES = ("reached", "progress", "mean_speed", "peak_speed", "speed_time", "tracking_error")
-"""Numbers of a trial whose median is shown."""
+"""Numbers of a trial that are shown as medians."""
 
 
 def run_trials(
@@ -91,7 +91,7 @@ def run_trials(
 
 
 def _about(scenario: Scenario) -> dict[str, Any]:
-    """What a result says of a scenario."""
+    """Return the statements of a result on a scenario."""
     terrain, start = scenario.terrain(), scenario.start
     return {
         "name": scenario.name,

@@ -44,7 +44,7 @@ class ValidationError(ValueError):
 
 @dataclass(frozen=True, kw_only=True)
 class Measurements:
-    """What was measured on a robot, or predicted by one simulator."""
+    """Measurements on a robot, or predictions of one simulator."""
 
     name: str
     values: Mapping[str, Table]
@@ -69,7 +69,7 @@ class PredictionErrors:
 
 @dataclass(frozen=True, kw_only=True)
 class RankAgreement:
-    """Whether a simulator puts policies in the order in which reality puts them."""
+    """Agreement of a simulator with reality on the order of policies."""
 
     tau: float | None
     """Kendall's τ-b, 1 for the same order, -1 for the reverse; None where all values are the same on one side."""

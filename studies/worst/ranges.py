@@ -71,7 +71,7 @@ class Parameter:
 
     name: str
     factor: str
-    """What it belongs to; a factor is in a case as a whole, or not at all."""
+    """Factor of the parameter; a factor is in a case as a whole, or not at all."""
     range: str
     """Field of ``Ranges``."""
     nominal: float
@@ -151,7 +151,7 @@ def make_case(name: str, values: Mapping[str, float], factors: Iterable[str]) ->
 
 @dataclass(frozen=True, kw_only=True)
 class Measures:
-    """What turns a case into a scenario of a robot and its policy."""
+    """Turns cases into scenarios of a robot and its policy."""
 
     mass: float
     """Of the whole robot [kg]."""

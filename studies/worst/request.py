@@ -58,7 +58,7 @@ class WorstStatus:
     """How far a search is, for the progress display."""
 
     stage: str
-    """What is being done, in a few words."""
+    """Present activity in a few words."""
     played: int
     """Cases so far."""
     fallen: int

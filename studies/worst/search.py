@@ -33,7 +33,7 @@ _PULL = 0.4
 
 @dataclass(frozen=True, kw_only=True)
 class Outcome:
-    """What came of a case."""
+    """Outcome of a case."""
 
     fell: bool
     diverged: bool

@@ -62,7 +62,7 @@ _REST, _REST_PLAYS = 0.4, 330
 _LEAST_SAMPLE, _MOST_SAMPLE = 30, 10_000
 """Least and largest number of cases of the random sample; 30 without a fall bound its probability by 10 %."""
 _REDUCED = 12
-"""Falls of the sample whose needless factors are taken away before the search."""
+"""Number of the sample's falls that lose their needless factors before the search."""
 
 Watch = Callable[[WorstStatus], None]
 
@@ -268,14 +268,14 @@ class _Log:
 
 @dataclass(kw_only=True)
 class _Found:
-    """What a search found."""
+    """Findings of a search."""
 
     sampled: list[Elite]
     sample_again: dict[str, list[Outcome]]
     """The falls of the sample, in each other engine."""
     failures: list[Elite]
     again: dict[str, dict[str, list[bool]]]
-    """Whether each failure fell, by its name and the engine, for each seed that was played."""
+    """True where a failure fell, by its name and the engine, for each seed that was played."""
     chosen: list[str]
     """Names of the failures that differ, played with all seeds."""
 

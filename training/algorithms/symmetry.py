@@ -23,7 +23,7 @@ from ..environment.configuration import ObservationConfiguration
 
 
 class SymmetryError(ValueError):
-    """What the networks see has no mirror image."""
+    """Raised where the networks' inputs have no mirror image."""
 
 
 @dataclass(frozen=True)
@@ -184,5 +184,5 @@ def half_replaced(rows: torch.Tensor, images: torch.Tensor) -> torch.Tensor:
 
 
 def second_halves(rows: torch.Tensor, sizes: Sequence[int]) -> torch.Tensor:
-    """What ``half_mirrored`` leaves as it is of blocks of these sizes, one after the other."""
+    """Return the rows that ``half_mirrored`` leaves as they are, of blocks of these sizes one after the other."""
     return torch.cat([block[len(block) // 2 :] for block in rows.split(list(sizes))])

@@ -1,4 +1,4 @@
-"""What the networks see: the noisy frame, its history, and the privileged state of teacher and critic.
+"""Make the inputs of the networks: the noisy frame, its history, and the privileged state of teacher and critic.
 
 The frame itself comes from the policy package's builder, the one that the gauge uses too. The privileged state is a table,
 ``PRIVILEGED_TERMS``, of functions of ``ObservationInputs``.

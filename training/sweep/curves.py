@@ -1,4 +1,4 @@
-"""What a run's log says of its learning: figures over environment steps."""
+"""Read figures of learning over environment steps from a run's log."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Curve = tuple[list[float], list[float]]
 """Environment steps [millions] and values."""
 
 TAGS = {"Train/mean_reward": "mean reward", "Curriculum/mean_level": "mean terrain level in training"}
-"""What is drawn, by its key in the log, beside the gauge's score."""
+"""Curves beside the gauge's score, by key of the log."""
 SCORE = "score in MuJoCo while training"
 FIGURES = (SCORE, *TAGS.values())
 """Titles of the charts, in order."""

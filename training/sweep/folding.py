@@ -1,4 +1,4 @@
-"""What became of a sweep: its runs as rows, its entries compared, its curves, and a page of all."""
+"""Fold a sweep: its runs as rows, its entries compared, its curves, and a page of all."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from .file import Sweep, SweepError
 from .runs import RUN_ERRORS, SCORES, SweepRun, read_card, what_failed
 
 _FOUND = (*("environment_steps", "training_seconds", "best_training_score", "policy", "results"), *SCORES)
-"""What a row says of a run, None where there is nothing yet."""
+"""Fields of a run's row, None where there is nothing yet."""
 
 
 def fold_sweep(
