@@ -257,7 +257,7 @@ def test_a_resume_that_is_refused_changes_nothing(refused, trained, change, name
     assert {f: f.read_bytes() for f in trained.rglob("*") if f.is_file()} == before
 
 
-@pytest.mark.parametrize("name", TASKS)
+@pytest.mark.parametrize("name", [n if i < 3 else pytest.param(n, marks=pytest.mark.slow) for i, n in enumerate(TASKS)])
 def test_a_resumed_run_has_the_settings_of_its_checkpoint_whatever_the_task_says_today(trained, name, monkeypatch):
     """All of them, also those that nobody had spelled out."""
     from gaitgauge.training.run import plan

@@ -169,7 +169,7 @@ def play(
     episodes: Sequence[Episode],
     script: FakeScript | None = None,
     *,
-    worlds: int = 1,
+    worlds: int = 6,
     terrain: Terrain | None = None,
     policy: ScriptedPolicy | None = None,
 ) -> list[Record]:

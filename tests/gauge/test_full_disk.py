@@ -48,7 +48,7 @@ def failing(monkeypatch, at: int, number: int) -> list[str]:
     ("at", "number"),
     [
         (0, errno.EROFS),
-        (1, errno.ENOSPC),
+        pytest.param(1, errno.ENOSPC, marks=pytest.mark.slow),
         pytest.param(5, errno.EIO, marks=pytest.mark.slow),
         pytest.param(-2, errno.ENOSPC, marks=pytest.mark.slow),
         (-1, errno.EDQUOT),

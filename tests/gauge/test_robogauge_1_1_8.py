@@ -107,11 +107,11 @@ def test_episodes_have_the_six_metrics_of_the_older_suite_bit_for_bit():
     found = []
     for suite in (short(OLD), short(NEW)):
         policy = load_policy("pretrained")
-        backend = make_backend("mujoco", scene(suite, 3, None))
+        backend = make_backend("mujoco", scene(suite, 7, None))
         equal = replace(suite, commands=replace(suite.commands, flat=suite.commands.levelled))
         rollout = Rollout(equal, policy, backend, lambda e: 0)
-        rollout.play([episode(DIAGONAL, MAXIMUM), episode(DIAGONAL, MAXIMUM, seed=1)])
-        found.append(sorted(to_the_end(rollout), key=lambda record: record.episode.seed))
+        rollout.play([episode(DIAGONAL, MAXIMUM)])
+        found.append(to_the_end(rollout))
         backend.close()
     for old, new in zip(*found, strict=True):
         assert (old.falls, old.physics_steps, len(old.samples)) == (new.falls, new.physics_steps, len(new.samples))

@@ -235,7 +235,7 @@ def test_what_a_policy_answers_for_empty_worlds_does_not_matter():
 def test_a_penetration_starts_the_goal_again_once_and_keeps_the_samples():
     """0.2 s after a reset, in the tenth control step; and again, without effect, in every later sub-command."""
     suite, policy = short_suite(REFERENCE), ScriptedPolicy()
-    record = play(suite, [episode(MAXIMUM)], FakeScript(penetration_time=at(0.2)), policy=policy)[0]
+    record = play(suite, [episode(MAXIMUM)], FakeScript(penetration_time=at(0.2)), policy=policy, worlds=1)[0]
     quiet = play(suite, [episode(MAXIMUM)])[0]
     assert record.restarted
     assert record.falls == 0
@@ -348,9 +348,9 @@ def test_an_episode_does_not_depend_on_worlds_order_or_neighbours(name):
 def test_an_episode_may_be_longer_than_the_table_of_noise(monkeypatch):
     suite = short_suite()
     policy = ScriptedPolicy()
-    play(suite, [episode(MAXIMUM)] * 2, policy=policy)
+    play(suite, [episode(MAXIMUM)] * 2, policy=policy, worlds=1)
     monkeypatch.setattr(noise, "TABLE_STEPS", 16)
     short = ScriptedPolicy()
-    play(suite, [episode(MAXIMUM)] * 2, policy=short)
+    play(suite, [episode(MAXIMUM)] * 2, policy=short, worlds=1)
     assert len(policy.seen) > 2 * 60
     assert torch.equal(torch.stack(policy.seen), torch.stack(short.seen))

@@ -126,7 +126,9 @@ def zero(estimate):
 
 
 def test_identical_engines_have_no_gap(request_of, tmp_path):
-    results = study(request_of(terrains=BOTH), tmp_path / "out", make=engine())
+    request = request_of(terrains=BOTH)
+    results = study(request, tmp_path / "out", make=engine())
+    assert results["policies"][0]["file_sha256"] == hashlib.sha256(Path(request.policies[0]).read_bytes()).hexdigest()
     pair = only_pair(results)
     for block in (pair["overall"], *pair["terrains"].values()):
         assert zero(block["gap"]) and zero(block["difference"])
@@ -288,13 +290,6 @@ def test_every_layer_plays_with_the_gains_of_the_suite_s_rule(request_of, tmp_pa
         assert seen == {(wanted,) * 12}
 
 
-def test_the_sha_256_is_that_of_the_policy_s_file(request_of, tmp_path):
-    request = request_of()
-    results = study(request, tmp_path / "out", make=engine())
-    file = Path(request.policies[0]).read_bytes()
-    assert results["policies"][0]["file_sha256"] == hashlib.sha256(file).hexdigest()
-
-
 def test_what_was_prepared_is_not_prepared_again_nor_changed(request_of, tmp_path, monkeypatch):
     def make(name, scene, *, device, threads):
         if scene.physics.impratio == 1.0:
@@ -336,7 +331,7 @@ def test_the_reference_can_be_any_engine(request_of, tmp_path):
     assert results["policies"][0]["pairs"]["fake"]["overall"]["difference"]["value"] > 0.0
 
 
-@pytest.mark.parametrize("reference", ["fake", "fake@ls_iterations=7"])
+@pytest.mark.parametrize("reference", [pytest.param("fake", marks=pytest.mark.slow), "fake@ls_iterations=7"])
 def test_a_difference_has_one_interval_wherever_it_stands(request_of, tmp_path, monkeypatch, reference):
     """Resamples are drawn by name: with another name in another table, one difference would have two intervals."""
 

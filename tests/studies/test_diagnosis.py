@@ -125,7 +125,7 @@ def few(*kinds: str):
 @pytest.mark.usefixtures("no_presets")
 def test_the_sign_of_gravity_is_named(monkeypatch):
     monkeypatch.setattr(diagnosis, "alternatives", few("sign of gravity"))
-    found = diagnose(described_as(BROKEN["sign of gravity"]), GO2, seconds=1.0)
+    found = diagnose(described_as(BROKEN["sign of gravity"]), GO2, seconds=0.6)
     assert not found.sound
     assert [m.kind for m in found.mistakes] == ["sign of gravity"]
     assert found.best.contract.hash == GOOD.hash
@@ -191,7 +191,7 @@ def test_worlds_do_not_ask_for_more_memory_than_a_small_machine_has(monkeypatch)
 @pytest.mark.usefixtures("no_presets")
 def test_a_good_description_is_left_alone(monkeypatch):
     monkeypatch.setattr(diagnosis, "alternatives", few("sign of gravity"))
-    found = diagnose(described_as(GOOD), GO2, seconds=1.0)
+    found = diagnose(described_as(GOOD), GO2, seconds=0.6)
     assert found.sound
     assert found.mistakes == ()
     assert found.verdict().startswith("nothing looks wrong")
@@ -201,7 +201,7 @@ def test_a_good_description_is_left_alone(monkeypatch):
 def test_a_policy_that_only_stands_is_not_sound(monkeypatch):
     """A robot that stands does what it is told while it is told to stand, and stays up."""
     monkeypatch.setattr(diagnosis, "alternatives", lambda contract, robot: [])
-    found = diagnose(described_as(replace(GOOD, action_scale=(0.001,) * 12)), GO2, seconds=1.0)
+    found = diagnose(described_as(replace(GOOD, action_scale=(0.001,) * 12)), GO2, seconds=0.6)
     assert not found.sound
     assert "none of 0 likely changes helps" in found.verdict()
 
@@ -218,7 +218,7 @@ def test_a_preset_is_found_and_what_it_mends_is_named(monkeypatch):
     wrong = replace(
         BROKEN["observation scale"], joint_names=GO2.sdk_joint_names, action_scale=(0.5,) * 12, action_clip=100.0
     )
-    found = diagnose(described_as(wrong), GO2, seconds=1.0)
+    found = diagnose(described_as(wrong), GO2, seconds=0.6)
     assert {m.kind for m in found.mistakes} == {"joint order", "observation scale", "action scale"}
     assert found.preset == "go2_rl_gym" and found.best.contract.action_clip == 100.0
     assert "runs its policies this way (preset go2_rl_gym)" in found.verdict()

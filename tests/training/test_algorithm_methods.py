@@ -255,8 +255,14 @@ def test_a_bare_policy_still_stands_still_in_a_resumed_run(method, tmp_path):
             assert torch.equal(getattr(resumed.alg, part).state_dict()[name], value), name
 
 
-@pytest.mark.parametrize("trimmed", [False, True])
-@pytest.mark.parametrize("method", ["cts", *FEW])
+@pytest.mark.parametrize(
+    ("method", "trimmed"),
+    [
+        pytest.param(m, t, marks=() if m == "him" or m in ("cts", "ac_moe") and not t else pytest.mark.slow)
+        for m in ("cts", *NEW)
+        for t in (False, True)
+    ],
+)
 def test_a_bare_policy_still_stands_still_in_a_run_that_begins_with_its_checkpoint(method, trimmed, tmp_path):
     """Of three iterations two were done: one is left, and what they learned is taken over."""
     configuration, network = bare_policy(method, tmp_path / "policy.pt", bootstrap_iterations=3)

@@ -197,7 +197,7 @@ def test_the_best_checkpoint_is_resumed_by_several_processes(tmp_path, monkeypat
     assert "best.pt' has no part of process 1" in said and "start anew, on the levels of the first" in said
 
 
-@pytest.mark.parametrize("change", ["another learning", "another iteration"])
+@pytest.mark.parametrize("change", [pytest.param("another learning", marks=pytest.mark.slow), "another iteration"])
 def test_a_part_that_was_not_written_with_the_checkpoint_is_not_taken(tmp_path, monkeypatch, change):
     """An earlier branch left it, and the run was killed before this one's second process had written."""
     path, _ = of_two(tmp_path, monkeypatch)

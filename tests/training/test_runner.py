@@ -64,7 +64,7 @@ def assert_same(a, b, skip=()):
             assert a[name] == b[name], name
 
 
-@pytest.mark.parametrize("encoder", ["mlp", "moe"])
+@pytest.mark.parametrize("encoder", [pytest.param("mlp", marks=pytest.mark.slow), "moe"])
 def test_continuing_equals_never_having_stopped(tmp_path, encoder):
     whole, first, second = (tmp_path / n for n in ("whole", "first", "second"))
     for folder in (whole, first, second):

@@ -61,11 +61,18 @@ def finished(tmp_path_factory):
     return folder
 
 
-@pytest.fixture
-def kept(finished, tmp_path):
+@pytest.fixture(scope="module")
+def kept_once(finished, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("kept") / "kept"
     runs, _ = plan_runs(SWEEP, finished, to_train=False)
-    assert keep_runs(SWEEP, runs, tmp_path / "kept") == (["one, seed 0"], {})
-    return tmp_path / "kept"
+    assert keep_runs(SWEEP, runs, folder) == (["one, seed 0"], {})
+    return folder
+
+
+@pytest.fixture
+def kept(kept_once, tmp_path):
+    """A folder of kept runs, to be changed."""
+    return Path(shutil.copytree(kept_once, tmp_path / "kept"))
 
 
 def test_the_report_of_what_was_kept_is_that_of_the_sweep(finished, kept):
@@ -230,7 +237,7 @@ def test_damaged_kept_curves_leave_the_score(kept):
 
 
 OTHER_SUITE = replace(SWEEP, suite="gaitgauge-1")
-OTHER_CARD = CARD.with_name("pretrained-gaitgauge-1.json")
+OTHER_CARD = CARD.with_name("standing-gaitgauge-1.json")
 
 
 @pytest.mark.parametrize("begun", [False, True])
