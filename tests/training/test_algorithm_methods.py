@@ -258,7 +258,7 @@ def test_a_bare_policy_still_stands_still_in_a_resumed_run(method, tmp_path):
 @pytest.mark.parametrize(
     ("method", "trimmed"),
     [
-        pytest.param(m, t, marks=() if m == "him" or m in ("cts", "ac_moe") and not t else pytest.mark.slow)
+        pytest.param(m, t, marks=() if m == "him" or (m in ("cts", "ac_moe") and not t) else pytest.mark.slow)
         for m in ("cts", *NEW)
         for t in (False, True)
     ],
