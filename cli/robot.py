@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from contextlib import ExitStack
 from dataclasses import asdict
@@ -14,7 +15,9 @@ from ..files.writing import make_folder, same_file, write_atomically
 from ..robots import Robot, RobotError, load_robot
 from ..robots.drafting import draft_robot
 from ..robots.examining import Finding, examine
+from ..robots.guessing import guessed_again
 from ..robots.loading import ROBOT_FILE, load_robot_file
+from ..robots.surveying import Answers
 from .console import Terminal, print_json, shell_command
 from .errors import UserError
 from .picture import Picture, Tile, choose_renderer
@@ -25,8 +28,23 @@ if TYPE_CHECKING:
 _EVERYTHING = "everything"
 
 
-def new_robot(model: Path, *, out: Path | None, name: str | None, force: bool) -> None:
-    """Write a first description, and print the guesses. An error restores all files.
+def asked(*, legs: str | None, feet: str | None, keyframe: str | None, pose: str | None) -> Answers:
+    """Return the answers that options give; raise ``UserError`` where ``pose`` is none."""
+    angles: dict[str, float] = {}
+    for each in (pose or "").split(",") if pose else ():
+        joint, equals, angle = each.strip().partition("=")
+        try:
+            angles[joint.strip()] = float(angle)
+        except ValueError:
+            equals = ""
+        if not equals or not math.isfinite(angles[joint.strip()]):
+            raise UserError(f"--pose has '{each}'; give angles in radians, such as hip_pitch=-0.3,knee=0.6")
+    names = [tuple(n.strip() for n in text.split(",") if n.strip()) if text else () for text in (legs, feet)]
+    return Answers(legs=names[0], feet=names[1], keyframe=keyframe, pose=angles)
+
+
+def new_robot(model: Path, *, out: Path | None, name: str | None, force: bool, answers: Answers | None = None) -> None:
+    """Write a first description, and print plan, mends and guesses. An error restores all files.
 
     Raises:
         UserError: there is a description, or a model with names, already.
@@ -38,7 +56,7 @@ def new_robot(model: Path, *, out: Path | None, name: str | None, force: bool) -
     if same_file(model, description):
         raise UserError(f"'{model}' would be replaced by the description; give the model another name, or --out")
     _refuse_existing(description, force)
-    draft = draft_robot(model, name, folder=folder)
+    draft = draft_robot(model, name, folder=folder, answers=answers)
     if draft.model:
         _refuse_existing(own, force)
     mjcf = own.name if draft.model else os.path.relpath(model.resolve(), folder.resolve())
@@ -56,10 +74,27 @@ def new_robot(model: Path, *, out: Path | None, name: str | None, force: bool) -
         undo.pop_all()
     console = Terminal()
     console.say(f"wrote {description}: {robot.title}, {len(robot.foot_names)} legs, {robot.num_joints} joints")
+    console.say(f"it is {draft.plan}")
     if draft.model:
-        console.say(f"wrote {own}: the model with names, and feet, that the description needs")
+        console.say(f"wrote {own}: the model, mended, with names and feet that the description needs")
+    if draft.mends:
+        console.say("\n  ".join(("mended there:", *draft.mends)))
     console.say("\n  ".join(("guessed, so look at it:", *draft.guesses)))
     console.say(f"next:\n  {shell_command(['robot', 'check', str(description)])}")
+
+
+def guess_again(path: Path) -> None:
+    """Make the guesses of a description again, and print those that changed; raise ``RobotError`` where that fails."""
+    text, changes, file = guessed_again(path)
+    earlier = file.read_bytes()
+    with ExitStack() as undo:
+        write_atomically(file, text, RobotError)
+        undo.callback(_restore, file, earlier)
+        load_robot_file(file)
+        undo.pop_all()
+    console = Terminal()
+    console.say("\n  ".join((f"wrote {file}; guessed anew:" if changes else f"{file}: every guess stays", *changes)))
+    console.say(f"next:\n  {shell_command(['robot', 'check', str(file)])}")
 
 
 def convert_motor(

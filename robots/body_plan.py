@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from .base import Robot
 from .limbs import joint_chain, pitch_joints
 from .loading import RobotError
+from .physical import physical_spec
 
 if TYPE_CHECKING:
     import mujoco
@@ -182,10 +183,8 @@ def base_mass(robot: Robot) -> float:
 
 
 def robot_model(robot: Robot) -> mujoco.MjModel:
-    """Compile the robot's model."""
-    import mujoco
-
-    return mujoco.MjModel.from_xml_path(str(robot.mjcf))
+    """Compile the robot's model, without visual meshes."""
+    return physical_spec(robot.mjcf).compile()
 
 
 def default_pose(robot: Robot) -> tuple[mujoco.MjModel, mujoco.MjData]:

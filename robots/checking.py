@@ -11,6 +11,7 @@ from ..files.parsing import did_you_mean, one_line
 from .apart import run_apart
 from .base import Robot
 from .loading import MOST_PARTS, RobotError, robot_digest
+from .physical import physical_spec
 
 if TYPE_CHECKING:
     import mujoco
@@ -54,15 +55,17 @@ def _inspect(robot: Robot) -> None:
 
 
 def compiled(mjcf: Path) -> tuple[mujoco.MjSpec, mujoco.MjModel]:
-    """Compile a MuJoCo model's file; raise ``RobotError`` where MuJoCo cannot."""
+    """Compile a MuJoCo model's file without its visual meshes; raise ``RobotError`` where MuJoCo cannot."""
     import mujoco
 
     try:
-        spec = mujoco.MjSpec.from_file(str(mjcf))
+        spec = physical_spec(mjcf)
         return spec, spec.compile()
     except (ValueError, RuntimeError, TypeError, MemoryError, OSError, mujoco.FatalError) as error:
+        if isinstance(error, RobotError):
+            raise
         reason = one_line(error)
-        if "unknown exception" in reason:  # MuJoCo's only words for a lack of memory
+        if "unknown exception" in reason or "allocate memory" in reason:  # MuJoCo's only words for a lack of memory
             reason = "it may need more memory than there is, or than it may use; make it smaller"
         raise RobotError(f"'{one_line(mjcf)}' is not a model that MuJoCo can compile: {reason}") from error
 

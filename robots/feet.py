@@ -23,6 +23,13 @@ _TIP = 0.1
 """Share of a mesh's length that counts as its end."""
 
 
+_CONTACT = (
+    *("contype", "conaffinity", "condim", "priority", "friction", "solmix", "solref", "solimp"),
+    *("margin", "gap", "group", "rgba"),
+)
+"""Properties of a shape that say how it meets others, and how it looks."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class ShankEnd:
     """The end of a shank, and a sphere there that would be a foot."""
@@ -90,8 +97,12 @@ def add_foot(body: mujoco.MjsBody, name: str, end: ShankEnd, shank: mujoco.MjsGe
         pos=[round(float(x), 5) for x in end.center],
         mass=0.0,
     )
-    for key in (
-        *("contype", "conaffinity", "condim", "priority", "friction", "solmix", "solref", "solimp"),
-        *("margin", "gap", "group", "rgba"),
-    ):
+    for key in _CONTACT:
         setattr(foot, key, getattr(shank, key))
+
+
+def copy_geom(body: mujoco.MjsBody, geom: mujoco.MjsGeom) -> None:
+    """Add a copy of a primitive shape to a body."""
+    copy = body.add_geom(name=geom.name)
+    for key in ("type", "size", "pos", "quat", "mass", *_CONTACT):
+        setattr(copy, key, getattr(geom, key))

@@ -90,9 +90,9 @@ def _read_variants(data: dict[str, Any], joints: list[str], source: str) -> None
         place = f"{source}: {where}{'.' if where else ''}"
         if isinstance(driven := table.get("driven_joints"), list):
             for word in driven:
-                if not any(isinstance(word, str) and _fits(word, joint) for joint in joints):
+                if not any(isinstance(word, str) and fits(word, joint) for joint in joints):
                     raise RobotError(f"{place}driven_joints has {shown(word)}, neither a joint nor words of its name")
-            table["driven_joints"] = [joint for joint in joints if any(_fits(word, joint) for word in driven)]
+            table["driven_joints"] = [joint for joint in joints if any(fits(word, joint) for word in driven)]
         if where and isinstance(held := table.get("default_joint_position"), dict) and isinstance(pose, list):
             own = dict(zip(joints, pose, strict=False))
             table["default_joint_position"] = _by_key(held, joints, f"{place}default_joint_position", own)
@@ -294,13 +294,13 @@ def _by_key(
 ) -> list[Any]:
     """Return the value of each joint in a table by words of names; a joint without one gets the value ``otherwise``."""
     for key in table:
-        if not any(_fits(key, joint) for joint in joints):
+        if not any(fits(key, joint) for joint in joints):
             hint = did_you_mean(key, [j.removesuffix(_JOINT_ENDING) for j in joints])
             unknown = f"the key {shown(key)}, which is neither a joint nor words of its name{hint}"
             raise RobotError(f"{where} has {unknown}")
     values = []
     for joint in joints:
-        fitting = [key for key in table if _fits(key, joint)]
+        fitting = [key for key in table if fits(key, joint)]
         if not fitting and otherwise is not None:
             values.append(otherwise[joint])
             continue
@@ -310,7 +310,7 @@ def _by_key(
     return values
 
 
-def _fits(key: str, joint: str) -> bool:
+def fits(key: str, joint: str) -> bool:
     """Return whether a key stands for the joint: the name, or whole words of it."""
     return f"_{key}_" in f"_{joint}_"
 

@@ -13,6 +13,7 @@ from .anatomy import anatomy
 from .base import JointParameters, Robot
 from .body_plan import body_plan, default_pose, lowest_point, sole_geoms
 from .loading import RobotError
+from .physical import physical_spec
 
 if TYPE_CHECKING:
     import mujoco
@@ -102,10 +103,8 @@ def keyframe_of(model: mujoco.MjModel, robot: Robot) -> str:
 
 
 def _left_standing(robot: Robot, *, upright: bool = False, ankles: Ankles | None = None) -> Stance:
-    import mujoco
-
     stance = stand_still(
-        mujoco.MjSpec.from_file(str(robot.mjcf)),
+        physical_spec(robot.mjcf),
         dict(zip(robot.joint_names, robot.default_joint_position, strict=True)),
         robot.parameters[robot.default_parameters],
         body_plan(robot).standing_height,

@@ -21,6 +21,9 @@ _ARCHITECTURES = "GPU architecture, such as sm_90 (H100, H200); repeatable. Defa
 _ENGINES = Choice("mujoco-warp or newton; repeatable. Default: mujoco-warp.", values=("mujoco-warp", "newton"))
 _ERROR = "Which difference its first input is. Default: known for the two public networks."
 ACTIVATIONS = ("softsign", "tanh", "relu", "elu", "identity")
+_LEGS = "A body, joint or shape of each leg, where it cannot be told which limbs are legs."
+_FEET = "Shapes or bodies that are the feet, for each leg one or more."
+_POSE = "Angles of the standing pose, by names of joints or words of them; others stay as guessed."
 _CHECKED = Choice("A robot.toml, its folder, or a robot's name.", values="robots", metavar="PATH")
 
 
@@ -73,15 +76,35 @@ def new(
     out: Annotated[Path | None, Choice("Folder of the robot.toml. Default: the model's.")] = None,
     name: Annotated[str | None, Choice("Name of the robot. Default: the model's.")] = None,
     force: Annotated[bool, Choice("Replace a robot.toml that is there.")] = False,
+    legs: Annotated[str | None, Choice(_LEGS, metavar="A,B")] = None,
+    feet: Annotated[str | None, Choice(_FEET, metavar="A,B")] = None,
+    keyframe: Annotated[str | None, Choice("The model's keyframe that is the standing pose.")] = None,
+    pose: Annotated[str | None, Choice(_POSE, metavar="JOINT=RAD,…")] = None,
 ) -> None:
-    """Write a first robot.toml from a MuJoCo model, and say what was guessed.
+    """Write a first robot.toml from a MuJoCo model; say its body plan, what was mended in a copy, and what was guessed.
 
     Examples:
       gaitgauge robot new mine/mine.xml
+      gaitgauge robot new mine/biped.xml --pose hip_pitch=-0.3,knee=0.6,ankle_pitch=-0.3
     """
-    from ..robot import new_robot
+    from ..robot import asked, new_robot
 
-    new_robot(model, out=out, name=name, force=force)
+    answers = asked(legs=legs, feet=feet, keyframe=keyframe, pose=pose)
+    new_robot(model, out=out, name=name, force=force, answers=answers)
+
+
+@command(robot)
+def guess(
+    robot: Annotated[Path, Choice("A robot.toml that `robot new` wrote, or its folder.", metavar="PATH")],
+) -> None:
+    """Make the guesses of a robot.toml again after an edit; what you changed stays.
+
+    Examples:
+      gaitgauge robot guess robots/mine
+    """
+    from ..robot import guess_again
+
+    guess_again(robot)
 
 
 @command(robot)

@@ -5,7 +5,8 @@ from pathlib import Path
 THIGH, SHANK, SOLE, HIP = 0.3, 0.28, 0.05, 0.1
 """Lengths of thigh and shank, height of the ankle above the ground, and half the distance of the hips [m]."""
 MASS = 8.0 + 2 * (3 * 0.5 + 1.5 + 1.0 + 0.6)
-ARMS_MASS = 4.0 + 2 * (0.2 + 0.5 + 0.4)
+ARMS_MASS = 0.1 + 2 * (0.1 + 0.5 + 0.4 + 0.1)
+"""Masses without arms, and of arms and head [kg]."""
 
 
 def _leg(side: str, left: int) -> str:

@@ -2,6 +2,7 @@
 
 import mujoco
 import pytest
+from gaitgauge.robots.motor_guess import guess_motors
 from gaitgauge.robots.surveying import Survey
 from unseen_robot import LEGS, write_unseen
 
@@ -17,8 +18,9 @@ def test_a_servo_s_gains_are_those_of_its_joint(tmp_path, gear):
     )
     mjcf.write_text(mjcf.read_text().replace("</mujoco>", f"<actuator>{servos}</actuator></mujoco>"))
     spec = mujoco.MjSpec.from_file(str(mjcf))
-    survey = Survey(mjcf, spec, spec.compile())
-    drafted = survey.motors(survey.hinges, 0.5)
+    model = spec.compile()
+    survey = Survey(mjcf, spec, model)
+    drafted = guess_motors(survey, survey.hinges, 0.5, model)
     assert drafted["stiffness"][0] == pytest.approx([20.0 * gear**2] * 12)
     assert drafted["damping"][0] == pytest.approx([0.5 * gear**2] * 12)
     assert drafted["torque_limit"][0] == pytest.approx([8.0 * abs(gear)] * 12)

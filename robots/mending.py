@@ -1,0 +1,121 @@
+"""Mend a copy of a robot's model: take out what carries or slows the robot, or stands beside it, and say what and where."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ..files.parsing import one_line
+
+if TYPE_CHECKING:
+    import mujoco
+
+_GRAVITY = (0.0, 0.0, -9.81)
+
+
+def mend(path: Path, spec: mujoco.MjSpec, model: mujoco.MjModel) -> list[str]:
+    """Mend the spec of a model, which holds one free joint at most; return a sentence with the line for each mend.
+
+    Args:
+        path: the model's file, whose lines the sentences name.
+        model: compiled from ``spec``.
+    """
+    import mujoco
+
+    lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+    mends: list[str] = []
+
+    def note(sentence: str, pattern: str) -> None:
+        at = next((i for i, line in enumerate(lines, 1) if re.search(pattern, line)), None)
+        mends.append(f"{path.name}{f', line {at}' if at else ''}: {sentence}")
+
+    free = [j for j in spec.joints if j.type == mujoco.mjtJoint.mjJNT_FREE]
+    for joint in free:
+        dof = int(model.jnt_dofadr[joint.id])
+        passive = {
+            "damping": model.dof_damping[dof],
+            "friction loss": model.dof_frictionloss[dof],
+            "armature": model.dof_armature[dof],
+            "stiffness": model.jnt_stiffness[joint.id],
+        }
+        if found := [f"{kind} {value:g}" for kind, value in passive.items() if value]:
+            joint.damping, joint.stiffness = 0.0 * joint.damping, 0.0 * joint.stiffness
+            joint.frictionloss = joint.armature = 0.0
+            free_line = r'<freejoint|type="free"'
+            note(
+                f"the free joint has {', '.join(found)}, perhaps of a <default>, which would carry the robot: taken out",
+                free_line,
+            )
+    beside = list(spec.worldbody.geoms)
+    for geom in beside:
+        name = f" '{geom.name}'" if geom.name else ""
+        note(
+            f"the geom{name} of the world, such as a floor, is none of the robot: taken out", _named("geom", geom.name)
+        )
+        spec.delete(geom)
+    for site in list(spec.worldbody.sites):
+        note(f"the site '{site.name}' of the world is none of the robot: taken out", _named("site", site.name))
+        spec.delete(site)
+    base = model.body_rootid[model.jnt_bodyid[free[0].id]] if len(free) == 1 else -1
+    for body in list(spec.worldbody.bodies):
+        if base >= 0 and model.body_rootid[body.id] != base:
+            note(
+                f"the body '{body.name}' hangs on the world and not on the robot: taken out", _named("body", body.name)
+            )
+            spec.delete(body)
+    held = (mujoco.mjtEq.mjEQ_WELD, mujoco.mjtEq.mjEQ_CONNECT)
+    for equality in list(spec.equalities):
+        if equality.type in held and "world" in (equality.name1 or "world", equality.name2 or "world"):
+            note(f"the equality '{equality.name}' ties the robot to the world: taken out", r"<(weld|connect)\b")
+            spec.delete(equality)
+    option = spec.option
+    if tuple(option.gravity) != _GRAVITY:
+        note(f"gravity is {_told(option.gravity)}: made {_told(_GRAVITY)}", r"gravity=")
+        option.gravity = _GRAVITY
+    if option.density or option.viscosity or any(option.wind):
+        note("the robot moves in a medium or wind (density, viscosity, wind): taken out", r"density=|viscosity=|wind=")
+        option.density = option.viscosity = 0.0
+        option.wind = (0.0, 0.0, 0.0)
+    override = int(mujoco.mjtEnableBit.mjENBL_OVERRIDE)
+    if option.disableflags or option.enableflags & override:
+        note("parts of the physics are disabled or overridden (option flag): made usual", r"<flag\b")
+        option.disableflags, option.enableflags = 0, option.enableflags & ~override
+    light = [body for body in spec.bodies if body.gravcomp]
+    for body in light:
+        note(f"the body '{body.name}' has gravity compensation: taken out", r"gravcomp=")
+        body.gravcomp = 0.0
+    return mends + _mend_motors(path, spec, model)
+
+
+def _mend_motors(path: Path, spec: mujoco.MjSpec, model: mujoco.MjModel) -> list[str]:
+    """Take motors out of a model that has not one on each hinge, with the sensors that read them; the engines bring their own."""
+    import mujoco
+
+    if not model.nu:
+        return []
+    hinges = [j for j in range(model.njnt) if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE]
+    driven = [
+        int(model.actuator_trnid[a, 0])
+        for a in range(model.nu)
+        if model.actuator_trntype[a] == mujoco.mjtTrn.mjTRN_JOINT
+    ]
+    if model.nu == len(hinges) and sorted(driven) == hinges:
+        return []
+    for sensor in list(spec.sensors):
+        if sensor.objtype == mujoco.mjtObj.mjOBJ_ACTUATOR:
+            spec.delete(sensor)
+    for key in spec.keys:
+        key.ctrl = []
+    for actuator in list(spec.actuators):
+        spec.delete(actuator)
+    told = f"{model.nu} actuators for {len(hinges)} hinges, not one for each: taken out, the engines bring their own"
+    return [f"{path.name}: {told}"]
+
+
+def _named(tag: str, name: str) -> str:
+    return rf'<{tag}\b[^>]*name="{re.escape(name)}"' if name else rf"<{tag}\b"
+
+
+def _told(values: object) -> str:
+    return one_line(" ".join(f"{float(v):g}" for v in values))  # type: ignore[attr-defined]
