@@ -100,7 +100,7 @@ def completed(command: str, parameter: str, incomplete: str = "") -> list[str]:
         ("evaluate", "terrains", "stairs", ["stairs_bd", "stairs_fd"]),
         ("evaluate", "backend", "mujoco-", ["mujoco-warp"]),
         ("evaluate", "pipeline", "s", ["stress"]),
-        ("evaluate", "robot", "go2", ["go2"]),
+        ("evaluate", "robot", "go2", ["go2", "go2w"]),
         ("consistency", "backends", "mujoco,new", ["mujoco,newton"]),
         ("train", "task", "go2-moe-c", ["go2-moe-cts"]),
         ("play", "viewer", "v", ["video", "viser"]),
