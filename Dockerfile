@@ -2,6 +2,7 @@
 #   docker build -t gaitgauge .                                   judging, on CPUs
 #   docker build -t gaitgauge:cuda --build-arg DEVICE=cuda .      training, on NVIDIA GPUs (docker run --gpus all …)
 #   … --build-arg KERNELS="sm_90"                                 its kernels compiled into the image
+#   docker run --rm --user "$(id -u):$(id -g)" -v "$PWD:/work" gaitgauge …    files in $PWD belong to you, not to root
 ARG PYTHON=3.12
 FROM python:${PYTHON}-slim-bookworm
 
@@ -30,6 +31,9 @@ ARG KERNELS=""
 RUN mkdir -p /opt/kernels && chmod 777 /opt/kernels \
     && for arch in $KERNELS; do gaitgauge warmup --arch "$arch" || exit 1; done \
     && chmod -R a+rwX /opt/kernels
+
+# For users that the image does not know (docker run --user): libraries ask for a home that can be written, and a name.
+ENV HOME=/tmp USER=gaitgauge
 
 # runs and results go into the folder that is mounted here
 WORKDIR /work
