@@ -212,6 +212,9 @@ class RunConfiguration:
     """Environment steps of every environment between two updates."""
     iterations: Annotated[int, Field(le=1_000_000_000)] = 10_000
     """Updates of the whole run."""
+    torch_threads: Annotated[int, Field(ge=1, le=1024)] | None = None
+    """CPU threads of torch; None for its own choice. On small tensors threads cost more than they give, and ten times the whole run's
+    time where other programs want the cores: each operation waits for all of them."""
     save_interval: int = 500
     """Updates between two checkpoints."""
     logger: str = "tensorboard"

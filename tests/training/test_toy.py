@@ -14,6 +14,7 @@ def test_it_trains_on_the_cpu_in_one_rollout_a_step():
     assert (plan.backend, plan.device, plan.suite) == ("mujoco", "cpu", "toy")
     # a limit of torque over speed makes MuJoCo stop at each substep
     assert not plan.task.environment.physics.torque_speed_limit
+    assert plan.task.training.run.torch_threads == 1
 
 
 @pytest.mark.parametrize(("limits", "command"), [((1.0, 0.0, 0.0), (0.75, 0.0, 0.0)), ((2.0, 1.0, 2.0), None)])

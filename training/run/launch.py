@@ -64,6 +64,9 @@ def train(
     run: Path | None = None
     seed_everything(run_settings.seed + Processes.told().rank)
     with ExitStack() as closing:
+        if run_settings.torch_threads is not None:
+            closing.callback(torch.set_num_threads, torch.get_num_threads())
+            torch.set_num_threads(run_settings.torch_threads)
         if first:
             run = _open_run(plan, closing, started, message)
         worlds = f"{plan.task.environment.num_envs} environments"

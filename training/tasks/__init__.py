@@ -238,7 +238,7 @@ def _toy() -> Task:
             entropy_coefficient=Ramp(start=0.01, end=0.002, begin=0.3, until=0.7),
         ),
         network=network,
-        run=RunConfiguration(experiment="toy", iterations=200, save_interval=100, gauge_interval=100),
+        run=RunConfiguration(experiment="toy", iterations=200, torch_threads=1, save_interval=100, gauge_interval=100),
     )
     title = "Unitree Go2 straight ahead on level ground (minutes of a CPU)"
     return Task(name="toy", title=title, environment=environment, training=training, backend="mujoco", suite="toy")
