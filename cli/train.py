@@ -146,21 +146,23 @@ class _Watch:
         now = clock.monotonic()
         self._recent.append((now, progress.iteration))
         done, total = progress.iteration, progress.total_iterations
-        text = f"iteration {done} of {total}, {self._left(progress, now)}"
+        times = "estimating time"
+        if len(self._recent) > 1:
+            times = f"{self._duration(progress, now, total - done)} left"
+            if progress.next_score is not None:
+                times += f", score in {self._duration(progress, now, progress.next_score)}"
+        text = f"iteration {done} of {total}, {times}"
         self._display.update(done / total, text, _shown(progress), last=done >= total)
 
-    def _left(self, progress: Progress, now: float) -> str:
-        """Return the time that is left, for people."""
-        remaining = progress.total_iterations - progress.iteration
+    def _duration(self, progress: Progress, now: float, remaining: int) -> str:
+        """Return the time for the next ``remaining`` iterations, for people."""
         (first, start), (last, end) = self._recent[0], self._recent[-1]
         seconds = progress.elapsed / max(progress.iteration, 1) * remaining
         if end > start:
             seconds = (last - first) / (end - start) * remaining
-        elif len(self._recent) < 2:
-            return "estimating time"
         if self._deadline is not None:
             seconds = min(seconds, max(self._deadline - now, 0.0))
-        return f"{duration(seconds)} left"
+        return duration(seconds)
 
 
 def _shown(progress: Progress) -> dict[str, str]:

@@ -13,11 +13,12 @@ import termios
 import threading
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import patch
 
 import pytest
 import torch
 from gaitgauge.cli.errors import UserError
-from gaitgauge.cli.train import parse_duration
+from gaitgauge.cli.train import _Watch, parse_duration
 from gaitgauge.files import writing
 from gaitgauge.gauge.result import TerrainScore, read_result
 from gaitgauge.gauge.store import StoreError
@@ -28,6 +29,7 @@ from gaitgauge.training.run.plan import prepare
 from gaitgauge.training.run.request import TrainRequest
 from gaitgauge.training.run.scoring import Scorer, scores_of
 from gaitgauge.training.run.side_process import PROGRAM
+from gaitgauge.training.run.stopping import Progress
 from gaitgauge.training.starting import processes_to_start
 from gaitgauge.training.tasks import TASKS
 from small_run import FAKE, SMALL
@@ -372,6 +374,26 @@ def test_time_limit_waits_for_no_score_unless_asked():
 )
 def test_a_task_has_a_suite_for_its_scores(choices, suite):
     assert prepare(TrainRequest(**choices)).suite == suite
+
+
+def test_the_time_until_the_next_score_is_told():
+    said = []
+
+    class Display:
+        def update(self, share, text, values, *, last):
+            said.append(text)
+
+    now = iter((100.0, 102.0, 104.0))
+    watch = _Watch(Display(), deadline=None)
+    with patch("gaitgauge.cli.train.clock.monotonic", lambda: next(now)):
+        for iteration, ahead in ((10, 40), (11, 39), (12, None)):
+            figures = {"scalars": {}, "best_score": None, "best_iteration": None, "next_score": ahead}
+            watch.update(Progress(iteration=iteration, total_iterations=100, elapsed=20.0, **figures))
+    assert said == [
+        "iteration 10 of 100, estimating time",
+        "iteration 11 of 100, 2 min 58 s left, score in 1 min 18 s",
+        "iteration 12 of 100, 2 min 56 s left",
+    ]
 
 
 def test_scorer_runs_the_command_line_of_evaluate(tmp_path, monkeypatch):

@@ -266,6 +266,7 @@ def test_best_is_chosen_by_the_gauge(tmp_path, monkeypatch):
     assert (runner.best_score, runner.best_iteration) == (0.6, 2)
     assert read_checkpoint(tmp_path / "best.pt")["iter"] == 2
     assert seen[-1].scalars["Gauge/quick/score"] == 0.4
+    assert [progress.next_score for progress in seen] == [1, 1, None]
     assert load_policy("best").contract == load_policy(tmp_path / "model_2.pt").contract
     resumed = make(tmp_path, seed=1)
     resume_run(resumed, tmp_path / "model_3.pt")

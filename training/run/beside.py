@@ -25,6 +25,11 @@ class Beside(Generic[Side]):
         self._side: Side | None = side
 
     @property
+    def made(self) -> bool:
+        """True where the run has the side process."""
+        return self._side is not None
+
+    @property
     def pending(self) -> bool:
         """True while a result is to come."""
         return self._side is not None and self._side.pending > 0

@@ -26,6 +26,7 @@ from ..environment.environment import TrainingEnvironment
 from ..processes import Processes, ProcessLostError
 from .checkpoint import CheckpointError
 from .filming import Filmer
+from .page import write_page
 from .plan import TrainPlan
 from .resuming import begin_with, resume_run
 from .run_directory import new_run_directory, read_run_json, update_run_json, write_parameters
@@ -88,6 +89,9 @@ def train(
                 limit = plan.request.seconds
                 seconds = None if limit is None else max(limit - (time.monotonic() - began), 0.0)
                 outcome = runner.learn(run_settings.iterations - runner.iteration, max_seconds=seconds)
+            if run is not None and plan.request.film and outcome.reason != "signal":
+                page = write_page(run, scores=plan.suite, scalars=runner.logger.scalars)
+                message(f"Page: {page}")
         except ProcessLostError:
             closing.pop_all()  # closing would wait for the lost process
             raise

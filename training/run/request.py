@@ -99,7 +99,11 @@ class TrainRequest:
         int | None, Ge(1), Choice("Iterations between two videos, made in a side process. Default: none.", WRITTEN)
     ] = None
     film: Annotated[
-        bool, Choice("At the end, film the policy: on level ground, and on stairs if the task has some.", WRITTEN)
+        bool,
+        Choice(
+            "At the end, film the policy on level ground, and on stairs if the task has some, and write a page.",
+            WRITTEN,
+        ),
     ] = True
     score_every: Annotated[int | None, Ge(1), Choice("Iterations between two scores. Default: the task's.", SCORES)] = (
         None

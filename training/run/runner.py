@@ -237,7 +237,9 @@ class TrainingRunner(RunState):
         self.videos.take(seconds, stop)
 
     def _snapshot(self, total: int, elapsed: float) -> Progress:
+        interval, ahead = self.configuration.run.gauge_interval, total - self.iteration
         return Progress(
+            next_score=min(interval - self.iteration % interval, ahead) if self.scores.made and ahead else None,
             iteration=self.iteration,
             total_iterations=total,
             elapsed=elapsed,

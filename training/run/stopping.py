@@ -39,6 +39,8 @@ class Progress:
     """Wall-clock time of this call of ``learn`` [s]."""
     scalars: Mapping[str, float]
     """Logged scalars by key."""
+    next_score: int | None
+    """Iterations until the next checkpoint is gauged; None where none is."""
     best_score: float | None
     """Best score of the gauge so far."""
     best_iteration: int | None
