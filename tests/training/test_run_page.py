@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 
 import pytest
+from gaitgauge.training.run import page
 from gaitgauge.training.run.page import PAGE, write_page
-from gaitgauge.training.sweep import curves
 from sample_results import sample
 
 RUN = {
@@ -29,14 +29,14 @@ def run(tmp_path, monkeypatch):
     for name in ("model_5_flat", "model_20_flat", "model_20_stairs_fd"):
         (tmp_path / "videos" / f"{name}.mp4").write_bytes(name.encode())
     points = {"mean reward": ([0.0, 1.0], [-2.0, 8.0]), "mean terrain level in training": ([0.0, 1.0], [0.0, 0.0])}
-    monkeypatch.setattr(curves, "learning_curves", lambda folder: points)
+    monkeypatch.setattr(page, "logged_curves", lambda folder: points)
     return tmp_path
 
 
 def test_without_a_score(run):
-    page = write_page(run, scores=None, scalars={"Episode_Termination/trunk_contact": 0.25, "Loss/value": 1.0})
-    text = page.read_text()
-    assert page == run / PAGE
+    written = write_page(run, scores=None, scalars={"Episode_Termination/trunk_contact": 0.25, "Loss/value": 1.0})
+    text = written.read_text()
+    assert written == run / PAGE
     assert "&lt;i&gt;mine&lt;/i&gt;" in text and "<i>mine" not in text
     assert "2.50 million steps" in text and "1.5 min of learning" in text
     assert text.count("<video") == 2  # those of the last checkpoint

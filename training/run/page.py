@@ -13,6 +13,7 @@ from ...gauge.report.breakdown import command_label
 from ...gauge.report.pages import page_template
 from ...gauge.result import EnvironmentRow, read_result
 from .checkpoint import CheckpointError
+from .curves import FIGURES, logged_curves
 from .filming import VIDEO_FOLDER
 from .run_directory import read_run_json
 from .scoring import GAUGE_FOLDER
@@ -38,9 +39,7 @@ def write_page(run: Path, *, scores: str | None, scalars: Mapping[str, float]) -
 
 def _render(run: Path, scores: str | None, scalars: Mapping[str, float]) -> str:
     """Return the page as HTML. Whatever names contain is shown as text and never becomes markup."""
-    from ..sweep.curves import FIGURES, learning_curves  # sweeps are made of runs
-
-    curves = learning_curves(run)
+    curves = logged_curves(run)
     folder = None if scores is None else _last_score(run / GAUGE_FOLDER)
     result = None if folder is None else read_result(folder / "results.json", CheckpointError)
     films = sorted((run / VIDEO_FOLDER).glob("*.mp4"), key=lambda film: int(film.stem.split("_")[1]))

@@ -9,21 +9,10 @@ from pathlib import Path
 
 from ...files.parsing import one_line, read_text
 from ...files.writing import csv_text
+from ..run.curves import FIGURES, LOSS, Curve, logged_curves
 from .file import SweepError
 from .runs import KEPT_CURVES
 
-Curve = tuple[list[float], list[float]]
-"""Environment steps [millions] and values."""
-
-TAGS = {"Train/mean_reward": "mean reward", "Curriculum/mean_level": "mean terrain level in training"}
-"""Curves beside the gauge's score, by key of the log."""
-SCORE = "score in MuJoCo while training"
-FIGURES = (SCORE, *TAGS.values())
-"""Titles of the charts, in order."""
-_LOSS = "Loss/"
-"""Keys in the log that begin so are kept under their own names, and not drawn."""
-_MOST, _MOST_OF_A_LOSS = 400, 100
-"""Largest number of points of a curve."""
 _KEPT_HEAD = ("figure", "environment_steps_millions", "value")
 
 
@@ -36,28 +25,7 @@ def learning_curves(run: Path) -> dict[str, Curve]:
     """
     if (kept := run / KEPT_CURVES).is_file():
         return _read_curves(kept)
-    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-
-    events = EventAccumulator(str(run), size_guidance={"scalars": 0})
-    events.Reload()
-    known = events.Tags()["scalars"]
-    if "Perf/total_steps" not in known:
-        return {}
-    steps = {event.step: event.value / 1e6 for event in events.Scalars("Perf/total_steps")}
-    titles = {tag: title for tag, title in TAGS.items() if tag in known}
-    titles |= {tag: SCORE for tag in known if tag.startswith("Gauge/") and tag.endswith("/score")}
-    titles |= {tag: tag for tag in known if tag.startswith(_LOSS)}
-    found = {}
-    for tag, title in titles.items():
-        # a score stands at the number of iterations that were scored, all else at the index of the iteration
-        offset = 1 if title == SCORE else 0
-        # of an iteration that was done twice, before and after a resume, the later one counts
-        values = {e.step - offset: e.value for e in events.Scalars(tag) if e.step - offset in steps}
-        order = sorted(values)
-        most = _MOST_OF_A_LOSS if title == tag else _MOST
-        order = order[:: -max(math.ceil(len(order) / most), 1)][::-1]
-        found[title] = ([steps[at] for at in order], [values[at] for at in order])
-    return found
+    return logged_curves(run)
 
 
 def curves_csv(curves: Mapping[tuple[str, int], Mapping[str, Curve]]) -> str:
@@ -85,13 +53,13 @@ def _read_curves(path: Path) -> dict[str, Curve]:
             raise ValueError
         for figure, *point in rows[1:]:
             steps, value = map(float, point)
-            if not (figure in FIGURES or figure.startswith(_LOSS)) or not math.isfinite(steps + value):
+            if not (figure in FIGURES or figure.startswith(LOSS)) or not math.isfinite(steps + value):
                 raise ValueError
             for values, number in zip(found.setdefault(figure, ([], [])), (steps, value), strict=True):
                 values.append(number)
     except (ValueError, csv.Error) as error:
         raise SweepError(
-            f"the learning curves '{one_line(path)}' are damaged: each row has a figure ({', '.join(FIGURES)}, {_LOSS}…) and two numbers; "
+            f"the learning curves '{one_line(path)}' are damaged: each row has a figure ({', '.join(FIGURES)}, {LOSS}…) and two numbers; "
             "put the file back, or delete it and call again: the run is told without curves"
         ) from error
     return found
