@@ -48,7 +48,7 @@ from .result import ClusterName, Provenance, Result
 from .results import fold, rows_csv
 from .store import RunFolder, StoreError
 from .suite import Suite, SuiteError, load_suite
-from .suited import suited
+from .suited import measured, suited
 from .totals import health_of
 
 _WORLDS = 24
@@ -130,7 +130,7 @@ def prepare(request: Request) -> Prepared:
     asked = None if request.robot is None else load_robot(request.robot)
     policy = load_policy(request.policy, asked, trust=request.trust, contract_file=request.contract)
     robot = robot_for(policy.contract, request.robot)
-    suite = suited(suite, policy.contract)
+    suite = measured(suited(suite, policy.contract), robot)
     robot = with_parameters(suite, robot, request.parameters)
     check_fit(suite, robot, policy.contract)
     return Prepared(

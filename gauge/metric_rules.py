@@ -9,9 +9,10 @@ from typing import Annotated, Literal, NamedTuple
 from pydantic import Field
 
 from ..files.parsing import NotNegative, Positive, Share, Text
+from ..terrains.measured import GO2_LEG as GO2_LEG
 
-GO2_MASS, GO2_LEG = 15.2064, 0.426
-"""Mass [kg] and leg length [m] of the robot that scales are stated for."""
+GO2_MASS = 15.2064
+"""Mass [kg] of the robot that scales are stated for."""
 
 
 class RobotScales(NamedTuple):
@@ -48,7 +49,10 @@ class Metrics:
     soft_limit: Annotated[float, Field(gt=0.0, le=1.0)]
     """Share of each joint range, around its middle, inside which no limit is exceeded."""
     soft_limit_joints: Annotated[tuple[Text, ...], Field(min_length=1, max_length=100)]
-    """The joints that the limit metric watches: ``hip``, ``thigh`` and ``calf`` by their place in the leg, else parts of names."""
+    """The joints that the limit metric watches: ``hip``, ``thigh`` and ``calf`` by their place in the leg, ``leg`` for all of legs,
+    else parts of names."""
+    motors: Literal["all", "legs"] = "all"
+    """Joints over which power and torque are averaged: of robots with arms the idle ones would dilute the mean."""
     zmp_span: Positive | None = None
     """Diagonal stance span that normalizes the ZMP distance [m]; None: that of the robot's default pose."""
     contact_share: Share = 0.05

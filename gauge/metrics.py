@@ -11,25 +11,20 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from functools import cached_property, partial
+from functools import partial
 
-import numpy as np
 import torch
 
 from ..backends.base import PhysicsState
 from ..files.parsing import did_you_mean, shown
 from ..files.plugins import guarded, load_plugin, origin, plugins
 from ..robots.base import Robot
-from ..robots.body_plan import LEG_PARTS, body_plan, joint_ranges, stance_span
 from ..robots.rotation import projected_gravity, rotate_inverse
 from .episodes import MOTION
-from .metric_rules import GO2_LEG, GO2_MASS, Metrics, RobotScales
+from .instants import Instants, MetricConstants, MetricError
+from .metric_rules import Metrics
 
 GROUP = "gaitgauge.metrics"
-
-
-class MetricError(ValueError):
-    """A metric that does not exist, cannot be loaded, or cannot be measured on a robot; the message is one sentence."""
 
 
 # ---- functions ----------------------------------------------------------------------------------------------------------
@@ -91,6 +86,11 @@ def joint_power(torque: torch.Tensor, velocity: torch.Tensor, scale: float) -> t
 def orientation(quaternion: torch.Tensor) -> torch.Tensor:
     """Return 1 - |lateral component of gravity's direction in the body frame| (Orientation Stability), roll alone: (N, 4) to (N,)."""
     return 1.0 - projected_gravity(quaternion)[:, 1].abs()
+
+
+def upright(quaternion: torch.Tensor) -> torch.Tensor:
+    """Return 1 - sin of the base's tilt, roll and pitch together: (N, 4) to (N,)."""
+    return 1.0 - torch.linalg.vector_norm(projected_gravity(quaternion)[:, :2], dim=1)
 
 
 def torque_smoothness(torque: torch.Tensor, before: torch.Tensor, known: torch.Tensor, scale: float) -> torch.Tensor:
@@ -181,100 +181,6 @@ def fill_flight(values: torch.Tensor, keep: torch.Tensor) -> torch.Tensor:
     return torch.where(defined, values, mean)
 
 
-# ---- the input of a metric ----------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, kw_only=True)
-class MetricConstants:
-    """The values that are the same for all instants of a robot in a suite."""
-
-    rules: Metrics
-    robot: Robot
-    weight: float
-    """Weight of the robot [N]."""
-    device: torch.device
-    dtype: torch.dtype
-
-    @cached_property
-    def limits(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Return indices, lower and upper soft limits, and full ranges [rad] of the watched joints, (W,) each.
-
-        ``soft_limit_joints`` names these joints by parts of legs (``LEG_PARTS``), or by parts of their names.
-
-        Raises:
-            MetricError: no such joint has limits.
-        """
-        rules, robot, plan, bounds = self.rules, self.robot, body_plan(self.robot), joint_ranges(self.robot)
-        watched = [
-            j
-            for j, name in enumerate(robot.joint_names)
-            if any(plan.part(j) == part if part in LEG_PARTS else part in name for part in rules.soft_limit_joints)
-            and np.isfinite(bounds[j]).all()
-        ]
-        if not watched:
-            raise MetricError(
-                f"the metric 'dof_limits' watches {', '.join(rules.soft_limit_joints)}, of which robot '{robot.name}' has no "
-                "joint with limits; give its joints a range in the model"
-            )
-        ranges = torch.tensor(bounds[watched], device=self.device, dtype=self.dtype)
-        middle, full = ranges.mean(1), ranges[:, 1] - ranges[:, 0]
-        soft = 0.5 * rules.soft_limit * full
-        return torch.tensor(watched, device=self.device), middle - soft, middle + soft, full
-
-    @cached_property
-    def scales(self) -> RobotScales:
-        """Return the factors on scales that are stated for the Go2."""
-        if self.rules.measure == "fixed":
-            return RobotScales()
-        plan = body_plan(self.robot)
-        heavier, longer = plan.mass / GO2_MASS, plan.leg_length / GO2_LEG
-        return RobotScales(force=heavier, torque=heavier * longer, power=heavier * math.sqrt(longer))
-
-    @cached_property
-    def span(self) -> float:
-        """Return the diagonal stance span [m]."""
-        return stance_span(self.robot) if self.rules.zmp_span is None else self.rules.zmp_span
-
-
-class SampledState:
-    """The columns of ``PhysicsState`` that the metrics of a suite need, of N samples, in the same shapes, frames and units."""
-
-    def __init__(self, columns: Mapping[str, torch.Tensor]) -> None:
-        self._columns = columns
-
-    def __getattr__(self, name: str) -> torch.Tensor:
-        try:
-            return self.__dict__["_columns"][name]
-        except KeyError:
-            raise MetricError(f"a metric reads {shown(name)} of the state; name it in the metric's 'state'") from None
-
-
-@dataclass(frozen=True, kw_only=True)
-class Instants:
-    """N instants of one robot's motion: the input of a metric."""
-
-    state: SampledState | PhysicsState
-    command: torch.Tensor
-    """Commanded velocities, forward, lateral [m/s] and yaw [rad/s], (N, 3)."""
-    limits: torch.Tensor
-    """Limits of the commands, (N, 3)."""
-    friction: torch.Tensor
-    """Friction coefficient, (N,)."""
-    torque_before: torch.Tensor
-    """Joint torque at the instant before [N·m], (N, J)."""
-    torque_known: torch.Tensor
-    """Instants with a torque before, (N,) bool."""
-    constants: MetricConstants
-
-    def with_contact(self, force: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
-        """Return values, (N,); where ``force`` [N], (N,), is too small a share of the weight (``contact_share``), NaN or, in a
-        suite with ``flight = "perfect"``, 1.
-        """
-        rules = self.constants.rules
-        carried = force > rules.contact_share * self.constants.weight
-        return torch.where(carried, values, torch.full_like(values, 1.0 if rules.flight == "perfect" else math.nan))
-
-
 # ---- the table ------------------------------------------------------------------------------------------------------------
 
 
@@ -323,6 +229,18 @@ def _zmp_margin(at: Instants) -> torch.Tensor:
     return at.with_contact(force[:, 2], zmp_margin(at.state.ground_moment_w, force, at.constants.span))
 
 
+def _support_margin(at: Instants) -> torch.Tensor:
+    """Return the depth of the ground's pressure in the support polygon over half a sole's width, at most 1."""
+    state, constants = at.state, at.constants
+    force, moment = state.ground_force_w, state.ground_moment_w
+    lift = force[:, 2:].clamp(min=1e-6)
+    pressure = state.contact_center_w[:, :2] + torch.stack((-moment[:, 1], moment[:, 0]), dim=1) / lift
+    carries = state.foot_normal_force > constants.rules.contact_share * constants.weight
+    corners = constants.soles.corners(state.base_position_w, state.base_quaternion_w, state.joint_position)
+    share = constants.soles.depth(pressure, corners, carries) / constants.soles.half_width
+    return at.with_contact(force[:, 2] * carries.any(dim=1), share.clamp(min=0.0, max=1.0))
+
+
 def _friction_margin(at: Instants) -> torch.Tensor:
     normal, least = at.state.foot_normal_force, at.constants.rules.foot_force
     margin = friction_margin(normal, at.state.foot_tangential_force, at.friction, least)
@@ -353,8 +271,8 @@ METRICS: Mapping[str, Metric] = {
     ),
     "dof_power": Metric(
         function=lambda at: joint_power(
-            at.state.joint_torque,
-            at.state.joint_velocity,
+            at.state.joint_torque[:, at.constants.motors],
+            at.state.joint_velocity[:, at.constants.motors],
             at.constants.rules.power_scale * at.constants.scales.power,
         ),
         state=("joint_torque", "joint_velocity"),
@@ -368,10 +286,16 @@ METRICS: Mapping[str, Metric] = {
         short_label="orien\u00adtation",
         group="quality",
     ),
+    "upright": Metric(
+        function=lambda at: upright(at.state.base_quaternion_w),
+        state=("base_quaternion_w",),
+        label="uprightness",
+        group="quality",
+    ),
     "torque_smoothness": Metric(
         function=lambda at: torque_smoothness(
-            at.state.joint_torque,
-            at.torque_before,
+            at.state.joint_torque[:, at.constants.motors],
+            at.torque_before[:, at.constants.motors],
             at.torque_known,
             at.constants.rules.torque_scale * at.constants.scales.torque,
         ),
@@ -386,6 +310,16 @@ METRICS: Mapping[str, Metric] = {
         label="ZMP margin",
         group="quality",
         prepare=lambda constants: constants.span,
+    ),
+    "support_margin": Metric(
+        function=_support_margin,
+        state=(
+            *("base_position_w", "base_quaternion_w", "joint_position", "foot_normal_force"),
+            *("ground_moment_w", "ground_force_w", "contact_center_w"),
+        ),
+        label="support margin",
+        group="quality",
+        prepare=lambda constants: constants.soles,
     ),
     "friction_margin": Metric(
         function=_friction_margin,

@@ -28,6 +28,7 @@ from ..files.parsing import (
 from ..robots.base import Damping, Stiffness
 from ..terrains.registry import terrain_names
 from .commands import Phase
+from .ground_rules import GroundRules
 from .metric_rules import Metrics
 
 SUITE_FOLDER = Path(__file__).parent / "suites"
@@ -249,6 +250,8 @@ class Suite:
     """Policies with other gains than ``gains = "suite"`` gives; the first family that fits a contract counts."""
     push: Push | None = None
     """None: nothing pushes."""
+    ground: GroundRules | None = None
+    """None: the published terrains, the same for every robot."""
     written: Suite | None = None
     """The suite as it is written, where this one was suited to a policy (``suited.suited``); no rule of a suite file."""
 
@@ -293,6 +296,8 @@ _ADDED: Mapping[str, Any] = {
     "gains": "suite",
     "families": (),
     "push": None,
+    "ground": None,
+    "metrics.motors": "all",
     "commands.beyond": "published",
     "written": None,
 }

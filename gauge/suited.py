@@ -7,7 +7,9 @@ from dataclasses import replace
 from typing import Literal
 
 from ..policy.contract import PolicyContract
+from ..robots import Robot
 from .commands import Command
+from .ground_rules import longer
 from .suite import Commands, Suite, SuiteError
 
 Axis = Literal["forward", "lateral", "yaw"]
@@ -47,6 +49,18 @@ def suited(suite: Suite, contract: PolicyContract) -> Suite:
             noise=replace(suite.noise, latency=min(suite.noise.latency, substeps)),
         )
     return suite if found == suite else replace(found, written=suite)
+
+
+def measured(suite: Suite, robot: Robot) -> Suite:
+    """Return the suite with the target's radius in a robot's own measure, where the suite says so; its digest stays that of the suite."""
+    if suite.ground is None:
+        return suite
+    radius = suite.commands.target_radius * longer(suite.ground, robot)
+    return replace(
+        suite,
+        commands=replace(suite.commands, target_radius=radius),
+        written=suite if suite.written is None else suite.written,
+    )
 
 
 def _within(commands: Commands, limits: Command) -> Commands:

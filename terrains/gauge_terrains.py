@@ -45,14 +45,15 @@ def flat() -> Terrain:
     return Terrain(name="flat", family="flat", spawns={"level_search": start, "level_eval": start})
 
 
-def slope(level: int, *, backward: bool = False) -> Terrain:
+def slope(level: int, *, backward: bool = False, rise: float = 1.0) -> Terrain:
     """Build a flat strip, then one plane that rises along +x to the far wall.
 
     Args:
         level: 1..10; the gradient is 0.10 + 0.47 x difficulty.
         backward: the robot starts turned around and walks backwards up the same slope.
+        rise: factor on the gradient, 1 for the published one; of the other terrains, on all heights.
     """
-    gradient = slope_gradient(level)
+    gradient = slope_gradient(level) * rise
     angle = math.atan(gradient)
     # The top face runs from (foot, z = 0) over 10 m in x; the centre lies 0.5 m, half the thickness, below its middle.
     ramp = Box(
@@ -71,14 +72,15 @@ def slope(level: int, *, backward: bool = False) -> Terrain:
     )
 
 
-def stairs(level: int, *, backward: bool = False) -> Terrain:
+def stairs(level: int, *, backward: bool = False, rise: float = 1.0) -> Terrain:
     """Build stairs that rise along +x from wall to wall: steps of one riser's thickness that overlap, hollow underneath.
 
     Args:
         level: 1..10; the riser is ``STAIR_RISERS[level - 1]``.
         backward: the robot starts turned around and walks backwards up the same stairs.
+        rise: as for ``slope``.
     """
-    riser = STAIR_RISERS[level - 1]
+    riser = STAIR_RISERS[level - 1] * rise
     half = (_HALF_TREAD_BOX, 5.0, riser / 2)
     middles = [(STAIR_TREAD * (step + 0.5), 0.0, (step + 0.5) * riser) for step in range(STAIR_COUNT)]
     steps = tuple(Box(center=middle, half_size=half) for middle in middles)
@@ -94,9 +96,9 @@ def stairs(level: int, *, backward: bool = False) -> Terrain:
     )
 
 
-def obstacle(level: int) -> Terrain:
-    """Build five bars across the whole width, 1 m long with gaps of 1 m, 0.05 + 0.23 x difficulty high [m]."""
-    height = 0.05 + 0.23 * level / 10
+def obstacle(level: int, *, rise: float = 1.0) -> Terrain:
+    """Build five bars across the whole width, 1 m long with gaps of 1 m, 0.05 + 0.23 x difficulty high [m]; ``rise`` as for ``slope``."""
+    height = (0.05 + 0.23 * level / 10) * rise
     bars = tuple(Box(center=(x, 0.0, height / 2), half_size=(0.5, 5.0, height / 2)) for x in (1.5, 3.5, 5.5, 7.5, 9.5))
     return _levelled(
         "obstacle",
@@ -108,12 +110,16 @@ def obstacle(level: int) -> Terrain:
     )
 
 
-def wave(level: int) -> Terrain:
-    """Build the sum of a sine along x (wavelength 2 m) and a cosine along y (8/3 m), between 0 and 0.08 x level [m]."""
+def wave(level: int, *, rise: float = 1.0) -> Terrain:
+    """Build the sum of a sine along x (wavelength 2 m) and a cosine along y (8/3 m), between 0 and 0.08 x level [m].
+
+    ``rise`` is as for ``slope``.
+    """
+    heights = wave_heights(level) if rise == 1.0 else wave_heights(level) * rise
     return _levelled(
         "wave",
         level,
-        height_field=HeightField(center=(5.0, 0.0), half_size=(5.0, 5.0), heights=wave_heights(level), base=0.1),
+        height_field=HeightField(center=(5.0, 0.0), half_size=(5.0, 5.0), heights=heights, base=0.1),
         search=(1.5, 1.25, 0.0),
         evaluation=(4.55, 0.0, 0.65 - 0.075 * (10 - level)),
         target=(6.5, -2.65, _WAVE_HEIGHT_PER_LEVEL * level),

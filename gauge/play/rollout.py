@@ -26,6 +26,7 @@ from ...backends.base import PhysicsBackend, Randomization
 from ...policy.base import Policy, PolicyError
 from ..episodes import QUALITY, Episode, Record
 from ..goals import TARGET
+from ..ground_rules import heavier
 from ..suite import Suite
 from .control_step import ControlStep, CpuStep, GpuStep
 from .feet import foot_torsion, torsion_varies
@@ -84,6 +85,7 @@ class Rollout:
         self._changed = self._launched = False
         self._randomized: list[tuple[float, float, float] | None] = [None] * backend.num_worlds
         self._turning = torsion_varies(suite, backend)
+        self._mass_scale = heavier(suite.ground, backend.scene.robot)
         self.control_steps = 0
         """Control steps so far, each of all worlds."""
         self.world_steps = 0
@@ -267,10 +269,10 @@ class Rollout:
         values = torch.tensor([wanted[world] for world in sorted(wanted)], device=device, dtype=dtype)
         # a mass changes constants that an engine has to work out anew
         present = [self._randomized[world] for world in wanted]
-        heavier = any(old is None or old[1] != new[1] for old, new in zip(present, wanted.values(), strict=True))
+        changed = any(old is None or old[1] != new[1] for old, new in zip(present, wanted.values(), strict=True))
         change = Randomization(
             friction=values[:, 0],
-            base_mass_offset=values[:, 1] if heavier else None,
+            base_mass_offset=values[:, 1] * self._mass_scale if changed else None,
             foot_torsion=values[:, 2] if self._turning else None,
         )
         self.backend.randomize(change, mask)

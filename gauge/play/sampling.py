@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from ...backends.base import PhysicsState
 from ...robots.base import Robot
-from ..metrics import Instants, MetricEvaluator, SampledState
+from ..instants import Instants, SampledState
+from ..metrics import MetricEvaluator
 from ..suite import Suite
 from .self_contact import SelfContact
 

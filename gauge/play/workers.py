@@ -35,8 +35,8 @@ from ...policy.foreign.fenced_policy import FencedPolicy
 from ...policy.loading import restore_policy
 from ...policy.native import FilePolicy
 from ...robots import Robot
-from ...terrains.registry import make_terrain
 from ..episodes import Episode, Record
+from ..ground_rules import build_terrain
 from ..motors import joint_parameters
 from ..suite import Suite
 from .remaining import Work
@@ -162,7 +162,7 @@ class Job:
         return Scene(
             robot=self.robot,
             parameters=joint_parameters(self.suite, self.robot, self.policy.contract),
-            terrains=tuple(make_terrain(name, level) for name, level in self.places),
+            terrains=tuple(build_terrain(self.suite.ground, self.robot, *place) for place in self.places),
             terrain_index=(0,) * self.worlds,
             physics=self.suite.physics,
         )

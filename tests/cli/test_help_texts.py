@@ -96,7 +96,7 @@ def completed(command: str, parameter: str, incomplete: str = "") -> list[str]:
 @pytest.mark.parametrize(
     ("command", "parameter", "incomplete", "offered"),
     [
-        ("evaluate", "suite", "gait", ["gaitgauge-1", "gaitgauge-1-network"]),
+        ("evaluate", "suite", "gait", ["gaitgauge-1", "gaitgauge-1-network", "gaitgauge-biped-1"]),
         ("evaluate", "terrains", "stairs", ["stairs_bd", "stairs_fd"]),
         ("evaluate", "backend", "mujoco-", ["mujoco-warp"]),
         ("evaluate", "pipeline", "s", ["stress"]),

@@ -1,7 +1,8 @@
 """Instants of a motion, and what the metrics of a suite make of them."""
 
 import torch
-from gaitgauge.gauge.metrics import Instants, MetricEvaluator
+from gaitgauge.gauge.instants import Instants
+from gaitgauge.gauge.metrics import MetricEvaluator
 from gaitgauge.gauge.play.sampling import GRAVITY
 from gaitgauge.gauge.suite import load_suite
 from gaitgauge.robots.body_plan import total_mass

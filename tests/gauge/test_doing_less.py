@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 import torch
 from gaitgauge.gauge.episodes import QUALITY, Episode, Record
-from gaitgauge.gauge.metrics import GO2_LEG, GO2_MASS, METRICS, Instants, SampledState, motion_done
+from gaitgauge.gauge.instants import Instants, SampledState
+from gaitgauge.gauge.metric_rules import GO2_LEG, GO2_MASS
+from gaitgauge.gauge.metrics import METRICS, motion_done
 from gaitgauge.gauge.play.feet import foot_torsion
 from gaitgauge.gauge.play.segments import Segment
 from gaitgauge.gauge.scoring import run_statistics
