@@ -80,6 +80,8 @@ def rotate(quaternion: torch.Tensor, vector: torch.Tensor) -> torch.Tensor:
 
 def turn(quaternion: torch.Tensor, angular_velocity_b: torch.Tensor, duration: float) -> torch.Tensor:
     """Orientation (N, 4) after ``duration`` [s] at a constant angular velocity in the body frame (N, 3) [rad/s]."""
+    if not bool(angular_velocity_b.any()):
+        return quaternion / quaternion.norm(dim=-1, keepdim=True)
     rate = angular_velocity_b.norm(dim=-1, keepdim=True)
     half_angle = 0.5 * duration * rate
     w1, v1 = quaternion[..., :1], quaternion[..., 1:]
@@ -379,10 +381,12 @@ class FakeBackend(PhysicsBackend):
         if script.diverge_time is not None:
             gone = self._since(script.diverge_time)[:, None]
             new = {name: torch.where(gone, torch.full_like(value, math.nan), value) for name, value in new.items()}
+        everywhere = bool(mask.all())
         for name, value in new.items():
             old = getattr(state, name)
-            old.copy_(torch.where(mask[:, None], value, old))
-        state.diverged |= mask & ~torch.cat(list(new.values()), dim=1).isfinite().all(dim=1)
+            old.copy_(value if everywhere else torch.where(mask[:, None], value, old))
+        moved = (new["base_position_w"], new["base_quaternion_w"], new["joint_position"])  # what velocities spoil, too
+        state.diverged |= mask & ~torch.cat(moved, dim=1).isfinite().all(dim=1)
         if script.overflow_time is not None:
             state.overflowed |= mask & self._since(script.overflow_time)
 
@@ -406,8 +410,8 @@ class FakeBackend(PhysicsBackend):
         """Record the first substep at which a watch tripped."""
         physics, state = self.scene.physics, self._state
         if physics.watch_tilt is not None:
-            up_w = rotate(state.base_quaternion_w, self._tensor((0.0, 0.0, 1.0)).expand(self.num_worlds, 3))
-            tilted = torch.acos(up_w[:, 2].clamp(-1.0, 1.0)) > physics.watch_tilt
+            lean = state.base_quaternion_w[:, 1:3].square().sum(1)  # 1 - 2 lean is the cosine of the tilt
+            tilted = 1.0 - 2.0 * lean < math.cos(physics.watch_tilt)
             state.tilt_substep[mask & tilted & (state.tilt_substep == 0)] = substep
         if physics.watch_penetration is not None:
             deep = self._since(self.script.penetration_time)
