@@ -7,7 +7,7 @@ import pickle
 import random
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from copy import copy
 from functools import cache
 from importlib.metadata import EntryPoint, distributions
@@ -142,6 +142,22 @@ def figures_of_results_are_checked_once() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         for module in (comparison, page):
             patch.setattr(module, "check_figures", check_figures)
+        yield
+
+
+@pytest.fixture(scope="module")
+def robots_are_tried_here() -> Iterator[None]:
+    """Robots of a test's own need no process of their own to be compiled in: ``test_hostile_models.py`` needs it."""
+    from gaitgauge.robots import checking, drafting, examining
+    from gaitgauge.robots.loading import model_files
+
+    def run_here(work: Callable[[], str | None], mjcf: Path) -> str:
+        model_files(mjcf)
+        return work() or ""
+
+    with pytest.MonkeyPatch.context() as patch:
+        for module in (checking, drafting, examining):
+            patch.setattr(module, "run_apart", run_here)
         yield
 
 

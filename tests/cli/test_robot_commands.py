@@ -15,6 +15,8 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "robots"))
 from stick_robot import write_stick
 from unseen_robot import LEGS, write_unseen
 
+pytestmark = pytest.mark.usefixtures("robots_are_tried_here")
+
 
 @pytest.fixture
 def model(tmp_path):

@@ -13,6 +13,8 @@ from gaitgauge.robots.loading import load_robot_file
 from stick_robot import LINK, MASS, PLATE, RADIUS, SHANKS, write_stick
 from unseen_robot import write_unseen
 
+pytestmark = pytest.mark.usefixtures("robots_are_tried_here")
+
 
 def described(model: Path) -> tuple[Draft, Robot]:
     """The first description of a model, and the robot that it is."""

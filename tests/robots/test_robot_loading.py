@@ -8,6 +8,8 @@ import pytest
 from gaitgauge.robots import JointParameters, RobotError, check_robot, checking, load_robot, robot_names
 from gaitgauge.robots.loading import robot_digest
 
+pytestmark = pytest.mark.usefixtures("robots_are_tried_here")
+
 LEGS = ("FL", "FR", "RL", "RR")
 
 
