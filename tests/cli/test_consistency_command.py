@@ -63,8 +63,7 @@ def test_two_settings_of_the_c_engine(run, refused, tmp_path, policy, tiny, monk
     assert str(out / "consistency.html") in again.stdout.replace("\n", "")
 
 
-@pytest.mark.parametrize("more", [(), ("--json",)])
-def test_an_engine_that_is_left_out_is_told(run, tmp_path, policy, tiny, monkeypatch, more):
+def test_an_engine_that_is_left_out_is_told(run, tmp_path, policy, tiny, monkeypatch):
     monkeypatch.setattr(open_loop, "DURATION", 0.3)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
 
@@ -89,13 +88,13 @@ def test_an_engine_that_is_left_out_is_told(run, tmp_path, policy, tiny, monkeyp
         "--threads",
         1,
     )
-    done = run(*command, "--no-attribution", "--out", tmp_path / "study", *more)
-    assert done.exit_code == 0, done.output
-    assert "mujoco-warp is left out" in done.stderr
-    told = done.stderr if more else done.stdout
-    assert "mujoco@cone=pyramidal is left out: it knows no pyramids" in told
-    if not more:
-        assert "mujoco-warp is left out" in done.stdout
+    for more in ((), ("--resume", "--json")):
+        done = run(*command, "--no-attribution", "--out", tmp_path / "study", *more)
+        assert done.exit_code == 0, done.output
+        assert "mujoco-warp is left out" in done.stderr
+        told = done.stderr if more else done.stdout
+        assert "mujoco@cone=pyramidal is left out: it knows no pyramids" in told
+        assert more or "mujoco-warp is left out" in done.stdout
 
 
 def test_bad_input_is_one_sentence(refused, policy, tmp_path):

@@ -138,6 +138,7 @@ def test_text_as_action(tmp_path):
     refused(graph_file(tmp_path / "policy.onnx", product, node, weights=[WEIGHT], output=TensorProto.STRING), "object")
 
 
+@pytest.mark.slow  # the same clock as that of test_fence_process.py
 def test_a_loop_without_an_end(tmp_path, monkeypatch):
     monkeypatch.setattr(fence_child, "STEP_SECONDS", 0)  # 1 s, which the system counts from a process's start
     value, truth = helper.make_tensor_value_info, TensorProto.BOOL

@@ -233,7 +233,9 @@ def test_beginning_with_a_bare_policy(method, tmp_path):
     assert "Loss/surrogate" in begun.logger.scalars
 
 
-@pytest.mark.parametrize("method", ["cts", *FEW])
+@pytest.mark.parametrize(
+    "method", ["cts", "him", *(pytest.param(m, marks=pytest.mark.slow) for m in NEW if m != "him")]
+)
 def test_a_bare_policy_still_stands_still_in_a_resumed_run(method, tmp_path):
     """Its critic and teacher were untrained, and full updates began at once."""
     configuration, network = bare_policy(method, tmp_path / "policy.pt", bootstrap_iterations=3)

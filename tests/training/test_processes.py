@@ -29,7 +29,13 @@ class Twins(Processes):
 
 
 @pytest.mark.parametrize(
-    ("method", "symmetry"), [("cts", "none"), ("cts", "alternate"), ("ac_moe", "alternate"), ("dreamwaq", "alternate")]
+    ("method", "symmetry"),
+    [
+        ("cts", "alternate"),
+        ("dreamwaq", "alternate"),
+        pytest.param("cts", "none", marks=pytest.mark.slow),
+        pytest.param("ac_moe", "alternate", marks=pytest.mark.slow),
+    ],
 )
 def test_a_step_in_two_halves_is_the_same_step(method, symmetry):
     def learned(processes):

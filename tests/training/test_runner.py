@@ -300,7 +300,7 @@ def test_resume_refuses_what_does_not_fit(tmp_path):
 def test_beginning_with_a_bare_policy(tmp_path, symmetry):
     """First a teacher and a critic for the student, which stands still and acts everywhere; then both go on."""
     settings = toy_configuration(
-        algorithm={"symmetry": symmetry, "epochs": 20}, run={"bootstrap_iterations": 6, "nonfinite_limit": 0.5}
+        algorithm={"symmetry": symmetry, "epochs": 12}, run={"bootstrap_iterations": 6, "nonfinite_limit": 0.5}
     )
     mirror = toy_mirror() if symmetry != "none" else None
     trained = make(configuration=settings, mirror=mirror)
