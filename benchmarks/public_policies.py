@@ -151,7 +151,7 @@ def build_robot(body: Body, models: Path, folder: Path) -> Path:
     description = folder / "robot.toml"
     sdk = f"sdk_joint_names = {json.dumps(names)}\n"
     description.write_text(
-        text if "sdk_joint_names" in text else text.replace("\n[parameters", f"\n{sdk}\n[parameters", 1)
+        text if "sdk_joint_names" in text else text.replace("default_parameters =", f"{sdk}default_parameters =", 1)
     )
     load_robot(str(description))
     return description

@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from .picture import Quality
 
 _EVERYTHING = "everything"
+_SIDES = (90.0, 215.0)
+"""Directions in which the camera looks in the two views of a standing robot, from its right and from before it [deg]."""
 
 
 def asked(*, legs: str | None, feet: str | None, keyframe: str | None, pose: str | None) -> Answers:
@@ -180,7 +182,7 @@ def check_robot_files(asked: str, *, picture: Path | None, json_output: bool) ->
 
 
 def _draw(robot: Robot, quality: Quality, path: Path) -> None:
-    """Write a picture of the standing pose, or raise ``UserError``."""
+    """Write a picture of the standing pose from two sides, or raise ``UserError``."""
     import imageio.v3
     import numpy as np
 
@@ -193,11 +195,16 @@ def _draw(robot: Robot, quality: Quality, path: Path) -> None:
     plan = body_plan(robot)
     position[2] = plan.standing_height
     model = visual_model(robot, make_terrain("flat"), quality)
-    picture = Picture(Tile(model=model, heading=0.0, leg_length=plan.leg_length), size=quality.size)
+    views = []
+    for azimuth in _SIDES:
+        tile = Tile(model=model, heading=math.radians(azimuth - Picture.AZIMUTH), leg_length=plan.leg_length)
+        picture = Picture(tile, size=quality.tile)
+        try:
+            views.append(picture.draw(position, position[:3]))
+        finally:
+            picture.close()
     try:
-        imageio.v3.imwrite(path, np.ascontiguousarray(picture.draw(position, position[:3])))
+        imageio.v3.imwrite(path, np.ascontiguousarray(np.concatenate(views, axis=1)))
     except OSError as error:
         reason = error.strerror or error
         raise UserError(f"the picture '{path}' cannot be written: {reason}; choose another --picture") from error
-    finally:
-        picture.close()
