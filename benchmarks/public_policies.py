@@ -32,9 +32,6 @@ HERE = Path(__file__).parent / "public_contracts"
 KATARI = "katari16_configs/go2_isaaclab.yaml"
 CONTRACTS = {
     "katari16_policy_dc_cfg_comparasion": KATARI,
-    "katari16_policy_pace_cfg_comparasion": KATARI,
-    "katari16_policy_pace_isaaclab": KATARI,
-    "katari16_policy_isaaclab_propioceptive_history": "katari16_configs/go2_isaaclab_history.yaml",
     "playground_go1": HERE / "playground_go1.toml",
     "playground_g1": HERE / "playground_g1.toml",
 }
