@@ -244,6 +244,11 @@ def deploy_settings(contract: PolicyContract, robot: Robot, *, finite_clips: boo
             f"a deploy.yaml numbers joints as the maker's SDK does, which the description of robot '{robot.name}' does not "
             "say; add sdk_joint_names to its robot.toml"
         )
+    if held := [name for name in numbered if name not in contract.joint_names]:
+        raise ExportError(
+            f"a deploy.yaml's controller drives every joint, and this policy leaves {len(held)} to be held, as '{held[0]}'; leave "
+            "deploy.yaml out"
+        )
     sdk = [numbered.index(name) for name in contract.joint_names]
     policy = [contract.joint_names.index(name) for name in numbered]
     clipped = any(term.clip is not None for term in contract.observation)

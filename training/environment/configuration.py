@@ -55,8 +55,10 @@ class JointConfiguration:
     friction_loss: Torque | None = None
     """Dry friction of every joint [N·m]; None keeps the set's. 0 spares the solver twelve constraints per world."""
     driven: tuple[str, ...] = ()
-    """Roles of the joints that the policy drives, or their beginnings (``hip``); motors hold all others in the standing pose. The robot's
-    description has a variant with these joints. Empty for the robot's own choice, all joints where its description says nothing."""
+    """Roles of the joints that the policy drives, or their beginnings (``hip``); motors hold all others in the standing pose. Empty for
+    the robot's own choice, all joints where its description says nothing."""
+    rigid: bool = False
+    """Make the joints that the policy does not drive rigid in the training physics, which has fewer degrees of freedom then."""
 
 
 @dataclass(frozen=True, kw_only=True)

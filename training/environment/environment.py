@@ -11,6 +11,8 @@ import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import torch
@@ -22,6 +24,7 @@ from ...backends.graphs import WARM_UP, RecordedFunction
 from ...backends.registry import make_backend
 from ...files.parsing import shown
 from ...robots.registry import load_robot
+from ...robots.welding import welded
 from ...terrains.height_scan import heading
 from ..configuration import ConfigurationError
 from .configuration import EnvironmentConfiguration
@@ -90,7 +93,10 @@ class TrainingEnvironment(VecEnv):
                 "off, without which it does nothing; turn the limit on, or leave motor_speed at 1,1"
             )
         self.cfg = self.configuration = configuration
-        self.robot = driven_robot(load_robot(configuration.robot), configuration)
+        whole = driven_robot(load_robot(configuration.robot), configuration)
+        self.contract = training_contract(whole, joint_parameters(whole, configuration), configuration)
+        self._model_folder = TemporaryDirectory(prefix="gaitgauge-robot-") if configuration.joints.rigid else None
+        self.robot = whole if self._model_folder is None else welded(whole, Path(self._model_folder.name))
         parameters = joint_parameters(self.robot, configuration)
         self.palette = build_palette(configuration.terrain)
         kind = assign_kinds([tile.share for tile in self.palette.tiles], configuration.num_envs)
@@ -105,7 +111,6 @@ class TrainingEnvironment(VecEnv):
         self.backend = make_backend(backend, scene, device=device, threads=threads)
         self.device = self.backend.device
         self.num_envs = configuration.num_envs
-        self.contract = training_contract(self.robot, parameters, configuration)
         self.num_actions = self.contract.num_joints
         self._generator = torch.Generator(device=self.device)
         self._generator.manual_seed(configuration.seed)
@@ -252,6 +257,8 @@ class TrainingEnvironment(VecEnv):
     def close(self) -> None:
         """Free the physics."""
         self.backend.close()
+        if self._model_folder is not None:
+            self._model_folder.cleanup()
 
     # --- parts of a step --------------------------------------------------------------------------------------------
 

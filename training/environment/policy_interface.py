@@ -6,6 +6,7 @@ import logging
 from dataclasses import replace
 from typing import Any
 
+from ...files.parsing import shown
 from ...policy.contract import History, ObservationTerm, PolicyContract, standard_contract
 from ...policy.observation_table import HEIGHT_SCAN
 from ...policy.robot_of import REMEMBERED
@@ -25,19 +26,20 @@ _log = logging.getLogger(__name__)
 
 
 def driven_robot(robot: Robot, configuration: EnvironmentConfiguration) -> Robot:
-    """Return the robot as the variant that ``joints.driven`` asks for. Raises ConfigurationError: its description has none."""
+    """Return the robot with the driven joints that ``joints.driven`` asks for. Raises ConfigurationError: a role that no joint has."""
     roles = configuration.joints.driven
     if not roles:
         return robot
     build = anatomy(robot)
-    names = [robot.joint_names[i] for i in sorted({i for role in roles for i in build.joints(role)})]
-    if (variant := robot.driving(names)) is None:
-        raise ConfigurationError(
-            f"environment.joints.driven is {', '.join(roles)}, which are {', '.join(names) or 'no joints'} of robot "
-            f"'{robot.name}', and its description has no variant that drives these; add [variants.{len(names)}] with driven_joints, "
-            "or leave environment.joints.driven empty"
-        )
-    return variant
+    for role in roles:
+        if not build.joints(role):
+            raise ConfigurationError(
+                f"environment.joints.driven has {shown(role)}, a role of no joint of robot '{robot.name}'; its joints are: "
+                f"{', '.join(dict.fromkeys(build.roles))}"
+            )
+    driven = {i for role in roles for i in build.joints(role)}
+    names = tuple(name for i, name in enumerate(robot.joint_names) if i in driven)
+    return replace(robot, driven_joints=names)
 
 
 def joint_parameters(robot: Robot, configuration: EnvironmentConfiguration) -> JointParameters:
@@ -91,4 +93,5 @@ def training_contract(
         stiffness=tuple(parameters.stiffness[i] for i in driven),
         damping=tuple(parameters.damping[i] for i in driven),
         control_period=configuration.physics.control_period,
+        held=robot.held if configuration.joints.driven else (),
     )
