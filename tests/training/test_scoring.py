@@ -104,13 +104,20 @@ def test_a_film_of_each_terrain_once(tmp_path, monkeypatch):
         assert command[command.index("--command") + 1 :] == ["0.75", "0.0", "0.0"]
 
 
-@pytest.mark.parametrize("last", [True, False])
-@pytest.mark.parametrize("wanted", [{"every": True, "last": False}, {"every": False, "last": True}])
-def test_films_at_the_end_or_every_so_often(tmp_path, monkeypatch, last, wanted):
-    filmer, asked = Filmer(tmp_path, terrains=("flat",), **wanted), []
+@pytest.mark.parametrize(
+    ("every", "last", "seconds", "filmed"),
+    [(True, False, 9.0, [7]), (False, True, 9.0, [8]), (True, True, 9.0, [7, 8]), (False, True, 0.0, [])],
+)
+def test_films_every_so_often_and_at_the_end(tmp_path, monkeypatch, every, last, seconds, filmed):
+    filmer, asked, said = Filmer(tmp_path, terrains=("flat",), every=every, last=last), [], []
     monkeypatch.setattr(filmer, "submit", lambda path, iteration: asked.append(iteration))
-    Videos(SimpleNamespace(iteration=7), filmer).submit(tmp_path / "model_7.pt", last=last)
-    assert asked == ([7] if wanted["last" if last else "every"] else [])
+    run = SimpleNamespace(iteration=7, message=said.append)
+    videos = Videos(run, filmer)
+    videos.submit(tmp_path / "model_7.pt")
+    run.iteration = 8
+    videos.finish(tmp_path / "model_8.pt", seconds)
+    assert asked == filmed
+    assert [sentence[:23] for sentence in said] == ["No film: the time limit"] * (seconds == 0.0)
 
 
 def test_a_machine_that_cannot_draw_is_told_once(tmp_path, monkeypatch):

@@ -88,10 +88,21 @@ class Scores(Beside[Scorer]):
 class Videos(Beside[Filmer]):
     """Videos of checkpoints."""
 
-    def submit(self, checkpoint: Path | None, *, last: bool = False) -> None:
-        """Ask for videos of a checkpoint, the ``last`` one of the run or another, if such are filmed."""
-        if self._side is not None and checkpoint is not None and (self._side.last if last else self._side.every):
+    def submit(self, checkpoint: Path | None) -> None:
+        """Ask for videos of a checkpoint, where checkpoints are filmed while the run goes on."""
+        if self._side is not None and checkpoint is not None and self._side.every:
             self._side.submit(checkpoint, self._run.iteration)
+
+    def finish(self, checkpoint: Path | None, seconds: float) -> None:
+        """Ask for videos of the last checkpoint, where that is filmed; say so if there are no ``seconds`` to wait for them [s]."""
+        if self._side is None or checkpoint is None or not self._side.last:
+            return
+        if seconds > 0.0:
+            self._side.submit(checkpoint, self._run.iteration)
+        else:
+            self._run.message(
+                "No film: the time limit leaves none for it; 'gaitgauge play latest --out film.mp4' makes one."
+            )
 
     def take(self, seconds: float = 0.0, stop: Callable[[], bool] = lambda: False) -> None:
         """Log finished videos, after a wait of at most ``seconds`` [s]."""

@@ -96,7 +96,7 @@ class TrainingRunner(RunState):
                 raise
             if reason != "signal":
                 self.scores.submit(written)
-                self.videos.submit(written, last=True)
+                self.videos.finish(written, self.configuration.run.gauge_wait)
                 self._wait(self.configuration.run.gauge_wait, lambda: signals.received is not None)
         self.logger.flush()
         code = 128 + signals.received if reason == "signal" and signals.received else 0

@@ -9,11 +9,10 @@ from ...files.choices import cpu_threads
 from ..tasks import TASKS, Task, find_task
 from .request import TrainRequest
 
-_TOY = TASKS["toy"]
-_CORE_RATE = 725.0
-"""Environment steps of ``go2-flat`` that one CPU core learns from a second, a measurement: half of 1,450 on two x86-64 cores."""
-_TOY_CORE_RATE = 2500.0
-"""The same of ``toy``."""
+_TOY, _TOY_TIMES = TASKS["toy"], (132e-6, 81e-6)
+"""CPU time of a step of ``toy`` on one core, and of the physics, which all cores share [s] (``benchmarks/toy_training.py``)."""
+_TIMES = (0.0, 1380e-6)
+"""The same of ``go2-flat``, which made 1,450 steps a second on two cores; torch, too, uses all cores there."""
 
 
 def check_gpu(request: TrainRequest) -> None:
@@ -32,16 +31,17 @@ def check_gpu(request: TrainRequest) -> None:
     cores = cpu_threads(None)
     raise DeviceError(
         f"task '{task.name}' trains on {backend}, which wants an NVIDIA GPU, and this machine has none",
-        f"'gaitgauge train toy' learns to walk here in {_time(_TOY, _TOY_CORE_RATE, cores)}, docs/start/first_training.ipynb "
+        f"'gaitgauge train toy' learns to walk here in {_time(_TOY, _TOY_TIMES, cores)}, docs/start/first_training.ipynb "
         f"trains go2-flat on a hosted GPU, and --backend mujoco trains this task here in "
-        f"{_time(task, _CORE_RATE, cores)}",
+        f"{_time(task, _TIMES, cores)}",
     )
 
 
-def _time(task: Task, rate: float, cores: int) -> str:
-    """Return about how long a task takes on some cores, for people."""
+def _time(task: Task, times: tuple[float, float], cores: int) -> str:
+    """Return about how long a task takes on some idle cores, for people."""
     run = task.training.run
-    minutes = run.iterations * run.steps_per_iteration * task.environment.num_envs / (rate * cores) / 60.0
+    step = times[0] + times[1] / cores
+    minutes = run.iterations * run.steps_per_iteration * task.environment.num_envs * step / 60.0
     if minutes < 90.0:
         return f"about {max(round(minutes), 1)} min"
     return f"about {minutes / 60.0:.0f} h" if minutes < 72 * 60 else f"about {minutes / 1440.0:.0f} days"
