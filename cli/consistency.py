@@ -13,11 +13,11 @@ from rich.text import Text
 
 from ..files.parsing import bare_name
 from ..studies.consistency.page import FIELD_LABELS, TESTS, cause, difference_of_fields, verdict, write_page
-from ..studies.consistency.request import StudyRequest, StudyStatus
+from ..studies.consistency.request import StudyCost, StudyRequest, StudyStatus
 from ..studies.consistency.study import prepare_study, study
 from ..studies.naming import free_run_folder, joined_names
 from .console import Terminal, make_table, print_json
-from .progress import ProgressDisplay
+from .progress import ProgressDisplay, duration
 from .studies import resumable
 
 
@@ -31,7 +31,9 @@ def run_consistency(request: StudyRequest, backends: str, *, out: Path | None, r
     folder = out or free_run_folder(usual, *prepared.runs)
     with resumable(console, "comparing", folder, "--resume") as display:
         own = ["gaitgauge", *sys.argv[1:]]
-        results = study(prepared, folder, resume=resume, command=own, watch=partial(_show, display))
+        results = study(
+            prepared, folder, resume=resume, command=own, watch=partial(_show, display), told=partial(_tell, console)
+        )
     page = write_page(folder)
     if json_output:
         _print_skipped(console, results["skipped"][len(prepared.skipped) :])  # those that failed while they played
@@ -43,9 +45,18 @@ def run_consistency(request: StudyRequest, backends: str, *, out: Path | None, r
 
 
 def _show(display: ProgressDisplay, status: StudyStatus) -> None:
-    share = (status.part - 1 + status.done / status.episodes) / status.parts
     text = f"run {status.part} of {status.parts}, {status.variant}: {status.done} of {status.episodes} episodes"
-    display.update(share, text, {"policy": status.policy})
+    if status.seconds_left is None:
+        text = f"measuring the speed of {status.variant}"
+    display.update(status.share, text, {"policy": status.policy}, left=status.seconds_left)
+
+
+def _tell(console: Terminal, cost: StudyCost) -> None:
+    """Print what the study takes, and what more would."""
+    console.say(f"{cost.runs} runs of {cost.episodes} episodes take about {duration(cost.seconds)}")
+    if cost.more:
+        more = "; ".join(f"{option} about {duration(seconds)}" for option, seconds in cost.more.items())
+        console.say(f"in all it would take with {more}")
 
 
 def _print_skipped(console: Terminal, skipped: Sequence[Mapping[str, str]]) -> None:

@@ -21,7 +21,9 @@ from ..running import command
 app = typer.Typer()
 
 _CONTESTANTS = "Two or more of: policies, as for evaluate; results folders; results.json files and score cards."
-_ENGINES = "Engines, separated by commas; NAME@option=value changes a physics option (mujoco@timestep=0.005)."
+_ENGINES = (
+    "Engines, separated by commas; NAME@option=value changes a physics option (mujoco@timestep=0.005). Default: two."
+)
 _JURY = "Engines, separated by commas. Default: one of each family that is installed, and MuJoCo with feet that turn freely."
 _OTHERS = "Engines in which failures are played again, separated by commas. Default: MuJoCo with feet that turn freely, and Drake."
 _COMPARED = "Folder of the comparison and its evaluations. Default: results/compare-<names>, and results/."
@@ -141,7 +143,7 @@ def jury(
 @command(app)
 def consistency(
     request: StudyRequest,
-    backends: Annotated[str, Choice(_ENGINES, PLACE, "backends")] = "mujoco,mujoco-warp,newton",
+    backends: Annotated[str, Choice(_ENGINES, PLACE, "backends")] = "",
     out: Annotated[Path | None, output("results/<policy>-<suite>-consistency")] = None,
     resume: Annotated[bool, resume("study")] = False,
     json_output: Tables = False,
@@ -149,8 +151,8 @@ def consistency(
     """Compare physics engines on the same policy and episodes: by how much they disagree, where, and why.
 
     Examples:
-      gaitgauge consistency pretrained --backends mujoco,mujoco-warp --device cpu --seeds 2
-      gaitgauge consistency latest --terrain flat --backends mujoco,mujoco@timestep=0.005
+      gaitgauge consistency pretrained
+      gaitgauge consistency latest --backends mujoco,mujoco-warp,newton --suite gaitgauge-1 --attribution
     """
     from ..consistency import run_consistency
 

@@ -13,14 +13,16 @@ from typing import Any
 import torch
 
 from ...backends.base import BackendError
+from ...backends.registry import find_backend
 from ...files.choices import cpu_threads
 from ...files.provenance import provenance
 from ...files.writing import json_text, write_atomically
 from ...gauge.evaluate import Request, common_identity, prepare
 from ...gauge.plan import Records
+from ...gauge.play.progress import Status
 from ...gauge.play.sampling import GRAVITY
 from ...gauge.results import health
-from ...gauge.store import RunFolder, StoreError
+from ...gauge.store import RunFolder, StoreError, check_folder
 from ...gauge.suite import Suite, SuiteError, load_suite
 from ...policy.loading import own_contract
 from ...policy.native import FilePolicy
@@ -29,18 +31,16 @@ from ...robots.body_plan import total_mass
 from ...robots.loading import robot_digest
 from ...terrains.registry import gauge_terrain_names
 from .attribution import FLOOR_DRAWS, Factor, choose_factors, effect_of_switch, rounded
+from .budget import Budget
 from .closed_loop import Cell, Design, compare, floor_only, gap_only, make_cells, play_variant
 from .models import compare_models
 from .open_loop import Trajectory, compare_trajectories, record_targets, replay
-from .request import ConsistencyError, StudyRequest, StudyStatus
+from .request import ConsistencyError, StudyCost, StudyRequest, StudyStatus
 from .variants import Variant, parse_variant, place
 
 SCHEMA = 3
 LEVEL = 3
 """Level of terrains that have levels, where none is asked for."""
-SEEDS_CPU, SEEDS_GPU = 3, 10
-"""Seeds where no number is asked for."""
-
 
 Watch = Callable[[StudyStatus], None]
 
@@ -93,6 +93,29 @@ class PreparedStudy:
             for variant in self.engines
         ]
 
+    @property
+    def draws(self) -> list[Variant]:
+        """Return the reference, perturbed, for the floor."""
+        return [rounded(self.reference, draw) for draw in range(1, FLOOR_DRAWS + 1)]
+
+    @property
+    def switches(self) -> list[tuple[Factor, Variant]]:
+        """Return which factor is switched in which engine: the reference's, and buffer sizes in the engines that have them."""
+        return self.switches_of(self.factors)
+
+    def switches_of(self, factors: Sequence[Factor]) -> list[tuple[Factor, Variant]]:
+        """Return the same for some factors."""
+        found = []
+        for factor in factors:
+            engines = self.others if factor.fixed_buffers_only else [self.reference]
+            found += [(factor, v) for v in engines if factor.applies(v, self.suite.physics)]
+        return found
+
+    def variants(self, factors: Sequence[Factor]) -> list[Variant]:
+        """Return all that is played of a policy, in order."""
+        switched = (factor.switch(v) for factor, v in self.switches_of(factors))
+        return list({v.label: v for v in (*self.engines, *self.draws, *switched)}.values())
+
     def drop(self, variant: Variant, reason: str) -> None:
         """Leave out an engine that turned out unable.
 
@@ -125,13 +148,11 @@ def prepare_study(request: StudyRequest) -> PreparedStudy:
         raise ConsistencyError("name at least one policy")
     suite = load_suite(request.suite)
     reference, others, skipped = _engines(request, suite)
-    on_gpu = any(torch.device(v.device).type == "cuda" for v in [reference, *others])
-    count = request.seeds if request.seeds is not None else SEEDS_GPU if on_gpu else SEEDS_CPU
-    if not 2 <= count <= 1000:
+    if not 2 <= request.seeds <= 1000:
         raise ConsistencyError(
-            f"{count} seeds are not possible; give 2 to 1000, since an interval needs a spread (--seeds)"
+            f"{request.seeds} seeds are not possible; give 2 to 1000, since an interval needs a spread (--seeds)"
         )
-    frictions = request.frictions or (suite.matrix.frictions if on_gpu else (suite.matrix.nominal_friction,))
+    frictions = request.frictions or (suite.matrix.nominal_friction,)
     levels = tuple(dict.fromkeys(request.levels or (LEVEL,)))
     for level in levels:
         if not 1 <= level <= suite.scoring.levels:
@@ -173,8 +194,8 @@ def prepare_study(request: StudyRequest) -> PreparedStudy:
         reference=reference,
         others=others,
         cells=make_cells(terrains, levels, tuple(dict.fromkeys(frictions))),
-        seeds=tuple(range(count)),
-        factors=choose_factors(request.factors) if request.attribution else (),
+        seeds=tuple(range(request.seeds)),
+        factors=choose_factors(request.factors) if request.attribution or request.factors else (),
         skipped=skipped,
     )
     prepared.require_two()
@@ -183,7 +204,7 @@ def prepare_study(request: StudyRequest) -> PreparedStudy:
 
 def _engines(request: StudyRequest, suite: Suite) -> tuple[Variant, list[Variant], list[dict[str, str]]]:
     """The reference, the others, and those that cannot run on this machine."""
-    variants = {v.label: v for v in (parse_variant(text) for text in request.backends)}
+    variants = {v.label: v for v in (parse_variant(text) for text in request.backends or default_engines())}
     wanted = parse_variant(request.reference).label if request.reference else next(iter(variants), None)
     if wanted is None or len(variants) + (wanted not in variants) < 2:
         raise ConsistencyError("a comparison needs two engines; give for example --backends mujoco,mujoco-warp")
@@ -202,6 +223,17 @@ def _engines(request: StudyRequest, suite: Suite) -> tuple[Variant, list[Variant
     return placed[wanted], [v for label, v in placed.items() if label != wanted], skipped
 
 
+def default_engines() -> tuple[str, str]:
+    """Return MuJoCo and one more that starts at once here: MuJoCo Warp on a GPU, else Drake, else MuJoCo without friction in turns."""
+    if torch.cuda.is_available():
+        return "mujoco", "mujoco-warp"
+    try:
+        find_backend("drake", "cpu")
+    except BackendError:
+        return "mujoco", "mujoco@foot_condim=3"
+    return "mujoco", "drake"
+
+
 def study(
     request: StudyRequest | PreparedStudy,
     folder: Path,
@@ -209,6 +241,7 @@ def study(
     resume: bool = False,
     command: Sequence[str] = (),
     watch: Watch = lambda _: None,
+    told: Callable[[StudyCost], None] = lambda _: None,
 ) -> dict[str, Any]:
     """Carry out a study; every finished episode is on disk at once.
 
@@ -217,7 +250,8 @@ def study(
     Args:
         request: what to compare, as it is or prepared already.
         folder: where ``consistency.json`` and a folder for each engine go (with several policies, one for each of them above).
-        watch: called after every control step.
+        watch: called a few times a second.
+        told: called before anything is played with what the study takes, and what more of it would.
 
     Raises:
         ConsistencyError, SuiteError, RobotError, PolicyError, ContractError, BackendError, WorkerError, StoreError: one sentence.
@@ -227,9 +261,14 @@ def study(
     request = prepared.request
     prepared = replace(prepared, others=list(prepared.others), skipped=list(prepared.skipped))  # engines may drop out
     torch.set_num_threads(1)  # several would change the last bits of the policy's output
+    for name, identity in prepared.runs:  # refused before engines are measured
+        check_folder(folder / name, identity, resume=resume)
+    budget = Budget(prepared, watch)
+    told(budget.cost)
     blocks = []
     for number, (name, policy) in enumerate(prepared.policies):
-        blocks.append(_Policy(prepared, name, policy, folder / prepared.home(number), resume=resume, watch=watch).run())
+        home = folder / prepared.home(number)
+        blocks.append(_Policy(prepared, name, policy, home, number, budget, resume=resume, watch=watch).run())
     results: dict[str, Any] = {
         "schema": SCHEMA,
         "suite": {"name": prepared.suite.name, "version": prepared.suite.version, "title": prepared.suite.title},
@@ -257,20 +296,27 @@ class _Policy:
     """The study of one policy."""
 
     def __init__(
-        self, prepared: PreparedStudy, name: str, policy: FilePolicy, folder: Path, *, resume: bool, watch: Watch
+        self,
+        prepared: PreparedStudy,
+        name: str,
+        policy: FilePolicy,
+        folder: Path,
+        number: int,
+        budget: Budget,
+        *,
+        resume: bool,
+        watch: Watch,
     ) -> None:
         self._prepared, self._name, self._policy, self._folder = prepared, name, policy, folder
         self._resume, self._watch = resume, watch
         self._records: dict[str, Records] = {}
         self._unable: dict[str, str] = {}
-        self._part, self._parts = 0, len(prepared.engines)
+        self._budget, self._number = budget, number
 
     def run(self) -> dict[str, Any]:
         """All layers; the closed loop comes first, since it finds out which engines can play these terrains."""
         prepared = self._prepared
-        switches = self._switches()
-        draws = [rounded(prepared.reference, draw) for draw in range(1, FLOOR_DRAWS + 1)]
-        self._parts += len({v.label for v in (*draws, *(factor.switch(v) for factor, v in switches))})
+        switches, draws = prepared.switches, prepared.draws
         for variant in prepared.engines:
             try:
                 self._play(variant)
@@ -314,12 +360,18 @@ class _Policy:
         prepared = self._prepared
         if variant.label in self._records:
             return self._records[variant.label]
-        self._part += 1
         episodes = prepared.design.episodes()
-        status = partial(StudyStatus, self._name, variant.label, self._part, self._parts, episodes=len(episodes))
+        part, parts, meter = self._budget.begin(self._number, variant)
+        status = partial(StudyStatus, self._name, variant.label, part, parts, episodes=len(episodes))
+
+        def watch(found: Status) -> None:
+            share, left = self._budget.look(found)
+            self._watch(status(done=found.done, share=share, seconds_left=left))
+
         with RunFolder(
             self._folder / variant.folder, prepared.identity(self._policy, variant), resume=self._resume
         ) as store:
+            played = len(store.records)
             play_variant(
                 variant,
                 episodes,
@@ -329,18 +381,12 @@ class _Policy:
                 records=store.records,
                 keep=store.put,
                 threads=cpu_threads(prepared.request.threads),
-                watch=lambda found: self._watch(status(done=found.done)),
+                watch=watch,
+                meter=meter,
             )
+        self._budget.end(counts=played == 0)
         self._records[variant.label] = store.records
         return store.records
-
-    def _switches(self) -> list[tuple[Factor, Variant]]:
-        """Which factor is switched in which engine: the reference's, and buffer sizes in the engines that have them."""
-        prepared, found = self._prepared, []
-        for factor in prepared.factors:
-            engines = prepared.others if factor.fixed_buffers_only else [prepared.reference]
-            found += [(factor, v) for v in engines if factor.applies(v, prepared.suite.physics)]
-        return found
 
     def _attribute(self, factor: Factor, variant: Variant) -> dict[str, Any]:
         """Switch a factor, play, and say what came of it."""

@@ -89,7 +89,7 @@ def test_an_engine_that_is_left_out_is_told(run, tmp_path, policy, tiny, monkeyp
         1,
     )
     for more in ((), ("--resume", "--json")):
-        done = run(*command, "--no-attribution", "--out", tmp_path / "study", *more)
+        done = run(*command, "--out", tmp_path / "study", *more)
         assert done.exit_code == 0, done.output
         assert "mujoco-warp is left out" in done.stderr
         told = done.stderr if more else done.stdout
