@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from .console import Terminal, make_table, print_json
 from .errors import UserError
 from .evaluate import shower
 from .progress import ProgressDisplay
-from .studies import own_folder, resumable
+from .studies import own_folder, resumable, show_turn
 
 
 def run_replay(request: ReplayRequest, *, out: Path | None, json_output: bool) -> None:
@@ -99,7 +100,7 @@ def _make(
             request,
             folder,
             command=["gaitgauge", *sys.argv[1:]],
-            watch=lambda turn, turns, what: display.update((turn - 1) / turns, f"{turn} of {turns}: {what}"),
+            watch=partial(show_turn, display),
         )
     if json_output:
         print_json(results)

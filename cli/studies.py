@@ -6,6 +6,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ import typer
 from ..files.writing import LOCK, lock_folder, make_folder
 from ..studies.naming import found_policies, free_folder, joined_names
 from ..studies.policies import lost_policy
+from ..studies.turns import Turn
 from .console import Terminal, print_json, shell_command
 from .errors import UserError
 from .policies import policy_files
@@ -61,6 +63,13 @@ def own_folder(folder: Path) -> Iterator[None]:
         lock.release()
 
 
+def show_turn(display: ProgressDisplay, turn: Turn) -> None:
+    """Show how far a study of several turns is."""
+    text = f"{turn.number} of {turn.count}: {turn.what}"
+    text += ", estimating time" * (turn.seconds_left is None)
+    display.update(turn.share, text, left=turn.seconds_left)
+
+
 def make_study(
     name: str,
     data: str,
@@ -92,7 +101,7 @@ def make_study(
             request,
             folder,
             command=["gaitgauge", *sys.argv[1:]],
-            watch=lambda turn, turns, name: display.update((turn - 1) / turns, f"{turn} of {turns}: {name}"),
+            watch=partial(show_turn, display),
         )
     if json_output:
         print_json(results)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,8 +19,6 @@ from ..policy.robot_of import robot_for, without_copy
 from ..robots import Robot, RobotError, load_robot
 from .naming import distinct_names
 
-Watch = Callable[[int, int, str], None]
-"""Called before each turn of a study with the turn's number, the count of turns and the policy's name."""
 Refused = dict[str, str]
 """``what`` was asked for and cannot be done while the rest was, as the user named it, and the ``reason``, one sentence."""
 

@@ -30,9 +30,11 @@ _EASY = 8.0
 """The same for level tests: the first ones are of easy levels and short, those at the end of a search take longer."""
 _AGAIN = 1.2
 """Length of a quality episode over the usual one where a penetration begins a goal again."""
+_SETTLING = 0.1
+"""Share of the time up to its limit that the longest segment of an episode takes on beyond the usual length."""
 _UNEVEN = 1.1
 """Time of a search over that of its tests played without a wait."""
-_OVERTIME = 0.3
+_OVERTIME = 0.35
 """Share of the time up to its limit that an episode is expected to take on beyond its usual length."""
 
 
@@ -136,7 +138,10 @@ class Lengths:
         for key in ((episode.stage, None), (episode.stage, episode.terrain)):
             total, count = self._ratios.get(key, (0.0, 0))
             ratio = (weight * ratio + total) / (weight + count)
-        return length._replace(steps=ratio * length.steps, longest=ratio * length.longest)
+        longest = ratio * length.longest
+        if episode.stage == "eval":  # of several segments, one settles for longer
+            longest += _SETTLING * max(length.limit - longest, 0.0)
+        return length._replace(steps=ratio * length.steps, longest=longest)
 
     def _length(self, goals: tuple[str, ...]) -> Length:
         if goals not in self._known:
@@ -253,10 +258,17 @@ class ProgressMeter:
         length = self.lengths.of(episode)
         if at is None:
             return length.longest, length.parts * length.steps
-        over = _OVERTIME * max(length.limit - at.youngest, 0.0) if episode.stage == "search" else 0.0
+        over = 0.0
+        if (
+            episode.stage == "search" or at.youngest > length.longest
+        ):  # robots settle for longer, or those before fell early
+            over = _OVERTIME * max(length.limit - at.youngest, 0.0)
         rest = max(length.longest - at.youngest, over, 5.0)
         steps = max(
-            length.parts * length.steps - at.steps, at.parts * length.steps - at.spent, at.parts * min(rest, 5.0), over
+            length.parts * length.steps - at.steps,
+            at.parts * length.steps - at.spent,
+            at.parts * min(rest, 5.0),
+            over * at.parts,
         )
         return rest, steps
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from typing import Any
@@ -69,8 +69,18 @@ class Notes:
     """Robots in all."""
 
 
-def collect(policy: Policy, robot: Robot, asked: LatentRequest, suite: Suite, terrains: tuple[Terrain, ...]) -> Notes:
+def collect(
+    policy: Policy,
+    robot: Robot,
+    asked: LatentRequest,
+    suite: Suite,
+    terrains: tuple[Terrain, ...],
+    told: Callable[[float], None] = lambda _: None,
+) -> Notes:
     """Let a policy's robots walk, on the CPU, and note what its encoder and experts say.
+
+    Args:
+        told: hears after each control step which share of them is done.
 
     Raises:
         BackendError: the engine cannot do it.
@@ -115,6 +125,7 @@ def collect(policy: Policy, robot: Robot, asked: LatentRequest, suite: Suite, te
             if step >= stands and (step - stands + 1) % every == 0:
                 up.append(~fallen)
                 seen.append((network.latent, network.weights, network.history.flatten(1)))
+            told((step + 1) / (stands + steps))
     keep = torch.cat(up).numpy()
     latents, weights, histories = zip(*seen, strict=True)
     index = np.tile(np.array(places, dtype=np.int64), (len(up), 1))[keep]

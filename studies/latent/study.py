@@ -17,13 +17,15 @@ from ...files.choices import cpu_threads
 from ...files.provenance import provenance
 from ...files.writing import csv_text, json_text, write_files
 from ...gauge.pipelines import check_friction
+from ...gauge.play.remaining import Stage
 from ...gauge.suite import Suite, SuiteError, load_suite
 from ...policy.base import PolicyError
 from ...policy.contract import ContractError
 from ...robots import RobotError
 from ...terrains.base import Terrain
 from ...terrains.registry import gauge_terrain_names, make_terrain
-from ..policies import Loaded, Watch, describe, load_policies
+from ..policies import Loaded, describe, load_policies
+from ..turns import Turns, Watch
 from .collecting import COMMANDS, Notes, collect
 from .figures import FIGURES, Points, draw, render_figure, render_page
 from .request import LatentRequest
@@ -31,6 +33,8 @@ from .separation import Separation, principal_components, separation
 
 PAIRS = {"terrains": "forward on every terrain", "commands": "every command on all terrains"}
 """Classes of the two figures, as in the paper."""
+_WALKING = 0.75
+"""Share of the time of a policy in which it walks; then its latents are told apart."""
 STRIDES = 10
 """Notes that a mean is taken over: a second, in which a robot takes two to three strides."""
 
@@ -40,7 +44,7 @@ class LatentError(ValueError):
 
 
 def study_latents(
-    request: LatentRequest, folder: Path, *, command: Sequence[str] = (), watch: Watch = lambda *_: None
+    request: LatentRequest, folder: Path, *, command: Sequence[str] = (), watch: Watch = lambda _: None
 ) -> dict[str, Any]:
     """Look at the latents of some policies. What cannot be looked at is said under ``refused``; the others are.
 
@@ -58,10 +62,13 @@ def study_latents(
     )
     entries: list[dict[str, Any]] = []
     points: list[tuple[str, Notes, dict[str, NDArray[np.float64]]]] = []
-    for number, (label, loaded) in enumerate(policies.items(), 1):
-        watch(number, len(policies), label)
+    turns = Turns(watch, [Stage(label, 1.0) for label in policies])
+    for label, loaded in policies.items():
+        turns.begin(label)
         try:
-            notes = collect(loaded.policy, loaded.robot, request, suite, terrains)
+            notes = collect(
+                loaded.policy, loaded.robot, request, suite, terrains, told=lambda done: turns.step(_WALKING * done)
+            )
             entry, places = look(label, loaded, notes, [t.name for t in terrains])
         except (PolicyError, ContractError, BackendError, RobotError, SuiteError, LatentError) as error:
             refused.append({"what": label, "reason": str(error)})

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -14,10 +15,12 @@ from ...files.choices import cpu_threads
 from ...files.parsing import one_line
 from ...files.provenance import provenance
 from ...files.writing import json_text, write_files
+from ...gauge.play.remaining import Stage
 from ...robots import JointParameters
 from ...robots.loading import PER_JOINT
 from ...robots.sets import find_set, set_text
 from ...version import __version__
+from ..turns import Turns, Watch
 from .identification import KINDS, Fit, held_out_ratios, identify
 from .log import Log, LogError
 from .page import render_identified
@@ -25,11 +28,12 @@ from .replaying import check_torque, fit_delay, hung_or_standing, read_logs
 from .request import IdentifyRequest
 from .rig import FixedRig, Motion, acting_parameters, at_rows, beginning, held_targets, num_steps
 
-Watch = Callable[[int, int, str], None]
+_HALVES = 0.7
+"""Work that each iteration of a fit leaves of what was left: it ends when it no longer changes."""
 
 
 def identify_robot(
-    request: IdentifyRequest, folder: Path, *, command: Sequence[str] = (), watch: Watch = lambda *_: None
+    request: IdentifyRequest, folder: Path, *, command: Sequence[str] = (), watch: Watch = lambda _: None
 ) -> dict[str, Any]:
     """Identify a robot's constants from logs; return the content of ``identify.json`` (docs/guides/real-robot.md).
 
@@ -47,21 +51,25 @@ def identify_robot(
     base_name, base = find_set(robot, request.base)
     turns = 1 + (len(logs) if request.held_out and len(logs) > 1 else 0)
 
-    def fit(some: Sequence[Log], turn: int, what: str) -> Fit:
+    told = Turns(watch, [Stage(str(turn), 1.0 if turn == 0 else (len(logs) - 1) / len(logs)) for turn in range(turns)])
+
+    def fit(some: Sequence[Log], what: str) -> Fit:
+        told.begin(what)
+        steps = itertools.count()
         return identify(
             some,
             base,
             draws=request.draws,
             seed=request.seed,
             threads=threads,
-            say=lambda step: watch(turn, turns, f"{what}, {step}"),
+            say=lambda _: told.step(1.0 - _HALVES ** next(steps)),
         )
 
-    found = fit(logs, 1, "all logs")
+    found = fit(logs, "all logs")
     entries = [_residuals(log, base, found.parameters, threads, fitted=True) for log in logs]
     for number, log in enumerate(logs if turns > 1 else []):
         others = [other for other in logs if other is not log]
-        without = fit(others, 2 + number, f"without {log.name}")
+        without = fit(others, f"without {log.name}")
         entries[number]["held_out"] = _residuals(log, base, without.parameters, threads, fitted=True)
     words = _provenance(logs, base_name, found)
     values = {f: getattr(found.parameters, f) for f in (*PER_JOINT, "delay")}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -21,7 +21,6 @@ from .request import PreflightRequest
 from .rig import FixedRig, acting_parameters, at_rows, beginning, held_targets, num_steps
 
 Verdict = Literal["fine", "wrong", "not told"]
-Watch = Callable[[int, int, str], None]
 _RESPONSE = 0.3
 """Least correlation of a joint's position with its target, at the best delay, of a joint that obeys."""
 _MOVES = 0.02
@@ -39,9 +38,7 @@ class Finding:
     sentence: str
 
 
-def preflight(
-    request: PreflightRequest, folder: Path, *, command: Sequence[str] = (), watch: Watch = lambda *_: None
-) -> dict[str, Any]:
+def preflight(request: PreflightRequest, folder: Path, *, command: Sequence[str] = ()) -> dict[str, Any]:
     """Check a log against a policy; return the content of ``preflight.json``.
 
     Raises:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,8 +14,10 @@ from ...backends.registry import choose_device, find_backend
 from ...files.choices import cpu_threads
 from ...files.provenance import provenance
 from ...files.writing import json_text, write_files
+from ...gauge.play.remaining import Stage
 from ...robots import JointParameters
 from ...robots.sets import find_set, joint_groups
+from ..turns import Turns, Watch
 from .log import Log, LogError, inverse_torque
 from .page import render_page, traces
 from .readers import read_log, read_map
@@ -23,7 +25,6 @@ from .request import LogOptions, ReplayRequest
 from .residuals import differences, noise, repeatability, summarize
 from .rig import FixedRig, Motion, acting_parameters, at_rows, beginning, held_targets, num_steps, play
 
-Watch = Callable[[int, int, str], None]
 LONGEST_DELAY = 0.03
 """Largest delay that is fitted [s]."""
 
@@ -81,7 +82,7 @@ def _check_hung(log: Log) -> None:
 
 
 def replay(
-    request: ReplayRequest, folder: Path, *, command: Sequence[str] = (), watch: Watch = lambda *_: None
+    request: ReplayRequest, folder: Path, *, command: Sequence[str] = (), watch: Watch = lambda _: None
 ) -> dict[str, Any]:
     """Replay logs with each parameter set in each engine; return the content of ``replay.json`` (docs/guides/real-robot.md).
 
@@ -98,13 +99,14 @@ def replay(
         find_backend(name, device)
     variants = [(f"{s} in {e}" if len(engines) > 1 else s, s, e) for e in engines for s in sets]
     entries, pictures = [], []
-    for number, log in enumerate(logs):
+    turns = Turns(watch, [Stage(label, float(len(log.time)), engine) for log in logs for label, _, engine in variants])
+    for log in logs:
         check_torque(log)
         motions: dict[str, Motion] = {}
         reference = None
         rows = []
-        for turn, (label, name, engine) in enumerate(variants):
-            watch(number * len(variants) + turn + 1, len(logs) * len(variants), f"{log.name}: {label}")
+        for label, name, engine in variants:
+            turns.begin(f"{log.name}: {label}")
             parameters, fitted = sets[name], None
             if request.fit_delay and parameters.delay is not None:
                 fitted = fit_delay(log, parameters, threads=cpu_threads(request.threads))

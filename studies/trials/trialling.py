@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from itertools import compress
 from pathlib import Path
@@ -16,22 +17,26 @@ from ...files.choices import cpu_threads
 from ...files.provenance import provenance
 from ...files.writing import csv_text, json_text, write_files
 from ...gauge.chance.intervals import wilson_interval
+from ...gauge.play.remaining import Stage
 from ...gauge.suite import SuiteError
-from ...policy.base import PolicyError
+from ...policy.base import Policy, PolicyError
 from ...policy.contract import ContractError, PolicyContract
 from ...robots import RobotError
-from ..policies import Watch, describe, load_policies
+from ..policies import describe, load_policies
+from ..turns import Turns, Watch
 from .page import render_page
 from .request import ALL, TrialRequest
 from .running import Trial, run_scenario
 from .scenario import Scenario, ScenarioError, load_scenario, scenario_names
 
+_LOOP = 3.0
+"""Robots whose steps take as long as the rest of the loop."""
 MEASURES = ("reached", "progress", "mean_speed", "peak_speed", "speed_time", "tracking_error")
 """Numbers of a trial that are shown as medians."""
 
 
 def run_trials(
-    request: TrialRequest, folder: Path, *, command: Sequence[str] = (), watch: Watch = lambda *_: None
+    request: TrialRequest, folder: Path, *, command: Sequence[str] = (), watch: Watch = lambda _: None
 ) -> dict[str, Any]:
     """Send every policy through every scenario. What cannot be done is said under ``refused``; the rest is done.
 
@@ -60,12 +65,16 @@ def run_trials(
     where: dict[str, Any] = {"backend": request.backend, "device": device, "threads": cpu_threads(request.threads)}
     entries = [_about(scenario) for scenario in scenarios.values()]
     turns = [(s, e, label) for s, e in zip(scenarios.values(), entries, strict=True) for label in policies]
-    for number, (scenario, entry, label) in enumerate(turns, 1):
-        watch(number, len(turns), f"{label} in {scenario.name}")
+    repeats = [request.repeats or scenario.repeats for scenario, *_ in turns]
+    told = Turns(
+        watch, [Stage(s.name, s.seconds * (_LOOP + n), s.name) for (s, *_), n in zip(turns, repeats, strict=True)]
+    )
+    for scenario, entry, label in turns:
+        told.begin(f"{label} in {scenario.name}")
         seeds = range(request.seed, request.seed + (request.repeats or scenario.repeats))
         policy, robot = policies[label].policy, policies[label].robot
         try:
-            trials = run_scenario(policy, robot, scenario, seeds, **where)
+            trials = run_scenario(policy, robot, scenario, seeds, watch=_steps(told, policy, scenario), **where)
         except (BackendError, ContractError, PolicyError, RobotError, SuiteError) as error:
             refused.append({"what": f"{label} in {scenario.name}", "reason": str(error)})
         else:
@@ -88,6 +97,12 @@ def run_trials(
     texts = {"trials.csv": as_csv(results), "trial.html": render_page(results), "trials.json": json_text(results)}
     write_files(folder, texts, ScenarioError)
     return results
+
+
+def _steps(told: Turns, policy: Policy, scenario: Scenario) -> Callable[..., None]:
+    """Return the function that counts control steps of a scenario."""
+    steps, whole = itertools.count(1), scenario.seconds / policy.contract.control_period
+    return lambda *_: told.step(min(next(steps) / whole, 1.0))
 
 
 def _about(scenario: Scenario) -> dict[str, Any]:
