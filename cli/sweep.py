@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import time as clock
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,9 @@ import typer
 from ..gauge.play.cluster import check_address
 from ..training.sweep.call import Kept, work_through
 from ..training.sweep.file import load_sweep
+from ..training.sweep.jobs import SweepStatus
 from .console import Terminal, make_table, print_json, shell_command
+from .progress import ProgressDisplay
 from .requests import SweepRequest
 from .train import parse_duration
 
@@ -33,17 +36,19 @@ def run_sweep(asked: SweepRequest) -> None:
     if asked.cluster is not None:
         check_address(asked.cluster)
         gauging = ["--cluster", asked.cluster, *([] if threads is None else ["--threads", str(threads)])]
-    done = work_through(
-        sweep,
-        folder,
-        threads=threads or max((os.cpu_count() or 2) // 2, 1),
-        per_gpu=asked.per_gpu,
-        gauging=gauging,
-        deadline=deadline,
-        report=asked.report,
-        keep=asked.keep,
-        say=errors.say,
-    )
+    with ProgressDisplay(errors, "sweep") as display:
+        done = work_through(
+            sweep,
+            folder,
+            threads=threads or max((os.cpu_count() or 2) // 2, 1),
+            per_gpu=asked.per_gpu,
+            gauging=gauging,
+            deadline=deadline,
+            report=asked.report,
+            keep=asked.keep,
+            say=errors.say,
+            watch=partial(_show, display),
+        )
     if done is None:
         raise typer.Exit(1)
     outcome = done.outcome
@@ -64,6 +69,12 @@ def run_sweep(asked: SweepRequest) -> None:
     unkept = {} if done.kept is None else done.kept.unkept
     if done.refused or done.failures or unkept or (outcome.unfinished and deadline is None):
         raise typer.Exit(1)
+
+
+def _show(display: ProgressDisplay, status: SweepStatus) -> None:
+    text = f"{status.done} of {status.count} runs done"
+    text += ", estimating time" * (status.seconds_left is None)
+    display.update(status.done / status.count, text, {"now:": ", ".join(status.running)}, left=status.seconds_left)
 
 
 def print_kept(console: Terminal, kept: Kept, of_all: str) -> None:

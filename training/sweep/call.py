@@ -11,7 +11,7 @@ from typing import Any
 from ...files.writing import lock_folder, make_folder
 from .file import Sweep, SweepError
 from .folding import fold_sweep
-from .jobs import Jobs, SweepOutcome
+from .jobs import Jobs, SweepOutcome, SweepStatus
 from .keeping import check_keep, keep_runs
 from .runs import SweepRun, plan_runs
 from .sharing import shared_gpus
@@ -61,6 +61,7 @@ def work_through(
     report: bool,
     keep: Path | None,
     say: Callable[[str], None],
+    watch: Callable[[SweepStatus], None] = lambda _: None,
 ) -> SweepCall | None:
     """Do the rest of a sweep, write its tables, and keep trained runs.
 
@@ -70,6 +71,7 @@ def work_through(
         report: write the tables of present results, and start nothing.
         keep: folder of kept runs; None for none.
         say: called with a sentence now and then.
+        watch: called every few seconds with how far all is.
 
     Returns:
         None where no entry can start: then tables of an earlier call, perhaps of another file, are not written over.
@@ -103,7 +105,14 @@ def work_through(
         context: AbstractContextManager[Mapping[str, str]] = shared_gpus(say) if shares else nullcontext({})
         with context as sharing:
             jobs = Jobs(
-                sweep, threads=threads, deadline=deadline, say=say, per_gpu=per_gpu, sharing=sharing, gauging=gauging
+                sweep,
+                threads=threads,
+                deadline=deadline,
+                say=say,
+                per_gpu=per_gpu,
+                sharing=sharing,
+                gauging=gauging,
+                watch=watch,
             )
             outcome = jobs.work([] if report else runs)
         found = fold_sweep(sweep, runs, refused, outcome.failures, folder)

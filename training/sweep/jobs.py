@@ -22,6 +22,7 @@ from ..run.side_process import ENVIRONMENT, await_end, parent_pipe
 from ..run.stopping import STOP_SIGNALS, StopSignals
 from .file import Sweep, SweepError
 from .runs import RUN_ERRORS, SweepRun, what_failed
+from .schedule import Running, seconds_left, told_left
 
 try:
     import fcntl
@@ -30,6 +31,8 @@ except ImportError:  # Windows
 
 _POLL = 0.1
 """Time between two looks at the processes [s]."""
+_WATCH_INTERVAL = 1.0
+"""Time between two calls of ``watch`` [s]."""
 _STOPPED = tuple(128 + number for number in STOP_SIGNALS)
 """Exit codes of trainings that were asked to stop (``stopping.StopSignals``)."""
 _PATIENCE = 120.0
@@ -56,6 +59,22 @@ class _Job:
     place: str
     process: subprocess.Popen[bytes]
     log: Path
+    began: float
+    """Value of ``time.monotonic()``."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SweepStatus:
+    """Progress of a sweep, for the display."""
+
+    done: int
+    """Runs that need nothing more."""
+    count: int
+    """Runs of this call."""
+    running: tuple[str, ...]
+    """Labels of those at work."""
+    seconds_left: float | None
+    """None while nothing tells how long a training takes."""
 
 
 def visible_gpus() -> list[str]:
@@ -79,6 +98,7 @@ class Jobs:
         per_gpu: int = 1,
         sharing: Mapping[str, str] | None = None,
         gauging: Sequence[str] | None = None,
+        watch: Callable[[SweepStatus], None] = lambda _: None,
     ) -> None:
         """Prepare.
 
@@ -91,7 +111,10 @@ class Jobs:
             per_gpu: trainings side by side on each GPU.
             sharing: variables in the environment of trainings on GPUs (``sharing.shared_gpus``).
             gauging: options of ``evaluate`` on the workers of a gauging; None for the threads.
+            watch: called every few seconds.
         """
+        self._watch, self._told = watch, float("-inf")
+        self._taken: dict[bool, list[float]] = {True: [], False: []}  # times of gaugings, and of trainings
         self._sweep, self._deadline, self._say = sweep, deadline, say
         self._gauging = ("--threads", str(threads)) if gauging is None else gauging
         gpus = visible_gpus() if gpus is None else gpus
@@ -117,11 +140,35 @@ class Jobs:
                 while signals.received is None and not self._late and (self._live or self._start()):
                     self._start()
                     self._collect()
+                    self._tell(len(runs))
                     time.sleep(_POLL)
             finally:
                 self._stop(lambda: signals.insisted)
         unfinished = [run.label for run in runs if self._is_left(run)]
         return SweepOutcome(failures=dict(self._failures), unfinished=unfinished, stopped=signals.received)
+
+    def _tell(self, count: int) -> None:
+        """Tell ``watch`` how far all is, now and then."""
+        now = time.monotonic()
+        if now - self._told < _WATCH_INTERVAL:
+            return
+        self._told = now
+        running = [
+            Running(gauges=job.place == "gauge", spent=now - job.began, left=told_left(job.log)) for job in self._live
+        ]
+        waiting = len(self._to_train) + len(self._to_gauge) + len(self._live)
+        left = seconds_left(
+            running,
+            to_train=len(self._to_train),
+            to_gauge=len(self._to_gauge),
+            places=max(len(self._places), 1) if any(run.on_gpu for run in self._to_train) else 1,
+            trained=self._taken[False],
+            gauged=self._taken[True],
+        )
+        if left is not None and self._deadline is not None:
+            left = min(left, max(self._deadline - now, 0.0))
+        labels = tuple(job.run.label for job in self._live)
+        self._watch(SweepStatus(done=count - waiting, count=count, running=labels, seconds_left=left))
 
     @property
     def _late(self) -> bool:
@@ -192,7 +239,7 @@ class Jobs:
                 start_new_session=True,
                 pass_fds=() if fcntl is None else (lock.fileno(),),
             )
-            self._live.append(_Job(run=run, place=place, process=process, log=log))
+            self._live.append(_Job(run=run, place=place, process=process, log=log, began=time.monotonic()))
             with suppress(OSError):  # a full disk
                 lock.truncate(0)
                 lock.write(f"{process.pid}{'' if place == 'gauge' else f' on {place}'}".encode())
@@ -202,6 +249,8 @@ class Jobs:
         """Take ended jobs and sort their runs on."""
         for job in [j for j in self._live if j.process.poll() is not None]:
             self._live.remove(job)
+            if job.process.returncode == 0:
+                self._taken[job.place == "gauge"].append(time.monotonic() - job.began)
             with self._failing(job.run):
                 self._take_in(job.run, job.process.returncode, job.log, gauged=job.place == "gauge")
 
