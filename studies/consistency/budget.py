@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING
 
 from ...files.choices import cpu_threads
 from ...gauge.play.progress import ProgressMeter, Status
@@ -15,11 +14,9 @@ from ...terrains.registry import gauge_terrain_names
 from ..engine_pace import EnginePace, measure_all, measure_cost
 from .attribution import choose_factors
 from .closed_loop import make_cells
+from .prepared import PreparedStudy
 from .request import StudyCost, StudyStatus
 from .variants import Variant
-
-if TYPE_CHECKING:
-    from .study import PreparedStudy
 
 _OPEN_LOOP = 700
 """Control steps of the open loop in an engine."""
