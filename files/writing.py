@@ -10,6 +10,7 @@ import math
 import os
 import re
 import secrets
+import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -175,7 +176,10 @@ def _strays(folder: Path) -> Iterator[Path]:
 
 def _flush(path: Path) -> None:
     """Wait until the disk holds a file, or the names in a folder."""
-    descriptor = os.open(path, os.O_RDONLY)
+    windows = sys.platform == "win32"  # opens no folder, and flushes only what may be written
+    if windows and path.is_dir():
+        return
+    descriptor = os.open(path, os.O_RDWR if windows else os.O_RDONLY)
     try:
         os.fsync(descriptor)
     finally:

@@ -136,3 +136,26 @@ def test_a_folder_has_one_writer(tmp_path, monkeypatch):
     lock_folder(tmp_path, WriteError).release()
     assert not stray.exists()
     assert all(path.exists() for path in kept)
+
+
+def test_files_are_written_by_the_rules_of_windows(tmp_path, monkeypatch):
+    """Windows opens no folder and flushes no file that is open for reading alone: every write failed there."""
+    import fcntl
+
+    opened, flushed = os.open, os.fsync
+
+    def open_file(path, flags, *more):
+        if os.path.isdir(path):
+            raise PermissionError(13, "Permission denied", str(path))
+        return opened(path, flags, *more)
+
+    def flush(descriptor):
+        if fcntl.fcntl(descriptor, fcntl.F_GETFL) & os.O_ACCMODE == os.O_RDONLY:
+            raise OSError(9, "Bad file descriptor")
+        flushed(descriptor)
+
+    monkeypatch.setattr("sys.platform", "win32")
+    monkeypatch.setattr("os.open", open_file)
+    monkeypatch.setattr("os.fsync", flush)
+    write_atomically(tmp_path / "a.json", "{}", RuntimeError)
+    assert (tmp_path / "a.json").read_text() == "{}"
