@@ -303,6 +303,7 @@ def _on_two_legs() -> Iterator[Task]:
                 title=f"Unitree G1 on {where}, {means}",
                 environment=environment,
                 training=replace(training, run=replace(training.run, experiment=name.replace("-", "_"))),
+                suite="gaitgauge-biped-1",
             )
 
 

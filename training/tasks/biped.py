@@ -19,6 +19,8 @@ from ..environment.configuration import (
     EnvironmentConfiguration,
     GaitConfiguration,
     JointConfiguration,
+    NoiseConfiguration,
+    ObservationConfiguration,
     PushConfiguration,
     RandomizationConfiguration,
     ResetConfiguration,
@@ -69,6 +71,8 @@ _WALK = EnvironmentConfiguration(
     physics=replace(TRAINING_PHYSICS, contacts_per_world=20),
     joints=JointConfiguration(driven=("hip", "knee", "ankle"), rigid=True),
     gait=GaitConfiguration(period=0.8, swing_share=0.45, swing_height=0.09),
+    # half as much again as gaitgauge-biped-1 adds
+    observations=ObservationConfiguration(noise=NoiseConfiguration(base_angular_velocity=0.3, joint_velocity=2.0)),
     rewards=_REWARDS,
     commands=CommandConfiguration(
         stages=(
@@ -111,6 +115,7 @@ _GROUND = TerrainConfiguration(
 )
 _ROUGH = replace(
     _WALK,
+    num_envs=16384,
     episode_length=25.0,
     physics=replace(TRAINING_PHYSICS, contacts_per_world=32),
     gait=replace(_WALK.gait, swing_height=0.13),
@@ -150,7 +155,7 @@ def walk(
     terrain: TerrainConfiguration, method: str, network: NetworkConfiguration
 ) -> tuple[EnvironmentConfiguration, TrainingConfiguration]:
     """Return the settings of a method on level ground, for a quarter of an hour on an H100."""
-    run = RunConfiguration(experiment="g1_walk", iterations=1200, save_interval=100, gauge_interval=0)
+    run = RunConfiguration(experiment="g1_walk", iterations=1800, save_interval=100, gauge_interval=0)
     return replace(_WALK, terrain=terrain), _training(method, network, run)
 
 
