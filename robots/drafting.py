@@ -191,6 +191,11 @@ def _draft(path: Path, name: str | None, home: Path, answers: Answers) -> str:
         ),
         Entry("default_parameters", "gauge"),
     ]
+    legs = [n for leg in survey.legs for n in (model.joint(j).name for j in leg.joints)]
+    if set(legs) != set(names):
+        entries.append(
+            Entry("variants.legs.driven_joints", legs, "for policies that drive the legs alone and hold the rest")
+        )
     motors = _standing_motors(survey, pose, joints, length, actuated)
     for key, (value, remark) in motors.items():
         table = joint_table(names, value) if isinstance(value, list) else value

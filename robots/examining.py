@@ -33,6 +33,8 @@ if TYPE_CHECKING:
     import mujoco
 
 _TRAINING_TIMESTEP = 0.005
+_GO2 = (15.206, 0.426)
+"""Mass [kg] and leg length [m] of the Go2."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,6 +85,7 @@ def _findings(robot: Robot) -> str:
         note("mirror image", partial(_mirror, robot), "training with symmetry")
         note("joint ranges", partial(_ranges, robot), "the metric dof_limits and the reward joint_limits")
         note("motor law", partial(_motor_law, robot), "training, whose physics steps 5 ms")
+        note("measure", partial(_measure, robot))
         note("parameters", partial(_parameters, robot), "the suites that ship with the project")
         note("SDK order", partial(_sdk, robot), "export of a deploy.yaml")
     return json.dumps([asdict(finding) for finding in found])
@@ -186,6 +189,17 @@ def _motor_law(robot: Robot) -> str:
             "motors' rotor inertia, or lower damping"
         )
     return f"in a step of {1e3 * _TRAINING_TIMESTEP:g} ms motors take up to {share:.1f} times a joint's speed away; below 2 is stable"
+
+
+def _measure(robot: Robot) -> str:
+    """Say how a robot's torques compare with those of the Go2, for which some suites state metrics in watts and newton metres."""
+    plan = body_plan(robot)
+    load = 9.81 * plan.mass * plan.leg_length
+    times = load / (9.81 * _GO2[0] * _GO2[1])
+    return (
+        f"weight times leg length is {load:.3g} N·m, {times:.2g} times a Go2's: suites of fixed measure (robogauge-1.1 and its kin) "
+        "judge its torque and power as a Go2's; others, such as gaitgauge-1, judge them in its own measure"
+    )
 
 
 def _parameters(robot: Robot) -> str:

@@ -109,8 +109,10 @@ def _mend_motors(path: Path, spec: mujoco.MjSpec, model: mujoco.MjModel) -> list
         key.ctrl = []
     for actuator in list(spec.actuators):
         spec.delete(actuator)
+    lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+    at = next((f", line {i}" for i, line in enumerate(lines, 1) if "<actuator" in line), "")
     told = f"{model.nu} actuators for {len(hinges)} hinges, not one for each: taken out, the engines bring their own"
-    return [f"{path.name}: {told}"]
+    return [f"{path.name}{at}: {told}"]
 
 
 def _named(tag: str, name: str) -> str:

@@ -52,6 +52,8 @@ def test_a_humanoid_is_described_with_mends(tmp_path):
     physics, data = default_pose(robot)
     over = (physics.body_mass @ data.xipos)[0] / physics.body_mass.sum() - body_plan(robot).foot_position[:, 0].mean()
     assert abs(over) < 0.02
+    assert robot.variants is not None and len(robot.variants["legs"].driven_joints) == 12
+    assert "weight times leg length is 1" in findings["measure"].sentence
     motors = robot.parameters["gauge"]
     of = dict(zip(robot.joint_names, motors.stiffness, strict=True))
     assert of["l_c"] > of["l_e"] > of["l_g"]
