@@ -16,7 +16,7 @@ from gaitgauge.training.run.resuming import begin_with, resume_run
 from gaitgauge.training.run.runner import TrainingRunner
 from gaitgauge.training.run.seeding import seed_everything
 from small_environment import STAIRS, make
-from toy_training import toy_configuration
+from toy_training import ToyEnv, toy_configuration, toy_contract
 
 SHARE = 36 / 75
 """Of the schedules after 6 iterations of 6 steps."""
@@ -152,14 +152,34 @@ class Both(Processes):
         return max(Both.asked[-2:])
 
 
-def of_two(folder, monkeypatch, said="one learning"):
-    """A checkpoint of two processes after one iteration; returns its path and the second one's ages."""
-    monkeypatch.setattr(Both, "said", said)
-    build(folder, processes=Both(rank=0, count=2)).learn(1)
-    second = build(folder, seed=1, processes=Both(rank=1, count=2))
-    second.learn(1)
-    monkeypatch.setattr(Both, "asked", ())
-    return folder / "model_1.pt", second.env.episode_length_buf.clone()
+@pytest.fixture(scope="module")
+def learned_by_two(tmp_path_factory):
+    """The folder of two processes after one iteration, by what they agree on, and the second one's ages."""
+
+    @cache
+    def learned(said):
+        folder = tmp_path_factory.mktemp("two")
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(Both, "said", said)
+            patch.setattr(Both, "asked", ())
+            build(folder, processes=Both(rank=0, count=2)).learn(1)
+            second = build(folder, seed=1, processes=Both(rank=1, count=2))
+            second.learn(1)
+        return folder, second.env.episode_length_buf.clone()
+
+    return learned
+
+
+@pytest.fixture
+def of_two(learned_by_two, tmp_path):
+    """Makes a checkpoint of two processes after one iteration; returns its path and the second one's ages."""
+
+    def make_checkpoint(said="one learning"):
+        folder, ages = learned_by_two(said)
+        shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
+        return tmp_path / "model_1.pt", ages
+
+    return make_checkpoint
 
 
 def resume_both(path):
@@ -170,14 +190,14 @@ def resume_both(path):
     return second, " ".join(said)
 
 
-def test_both_parts_of_a_checkpoint_are_resumed(tmp_path, monkeypatch):
-    path, ages = of_two(tmp_path, monkeypatch)
+def test_both_parts_of_a_checkpoint_are_resumed(of_two):
+    path, ages = of_two()
     second, said = resume_both(path)
     assert torch.equal(second.env.episode_length_buf, ages) and not second.fresh and not said
 
 
-def test_parts_from_before_they_were_told_apart_are_resumed(tmp_path, monkeypatch):
-    path, ages = of_two(tmp_path, monkeypatch)
+def test_parts_from_before_they_were_told_apart_are_resumed(of_two):
+    path, ages = of_two()
     for file in (path, rank_file(path, 1)):
         entries = torch.load(file, weights_only=True)
         del (entries["training"] if file is path else entries)["written"]
@@ -186,9 +206,9 @@ def test_parts_from_before_they_were_told_apart_are_resumed(tmp_path, monkeypatc
     assert torch.equal(second.env.episode_length_buf, ages) and not said
 
 
-def test_the_best_checkpoint_is_resumed_by_several_processes(tmp_path, monkeypatch):
+def test_the_best_checkpoint_is_resumed_by_several_processes(tmp_path, of_two):
     """It is a copy of the first process's part alone."""
-    path, _ = of_two(tmp_path, monkeypatch)
+    path, _ = of_two()
     copy_checkpoint(path, tmp_path / "best.pt")
     second, said = resume_both(tmp_path / "best.pt")
     first = torch.load(path, weights_only=True)["training"]["environment"]["memory"]
@@ -198,12 +218,12 @@ def test_the_best_checkpoint_is_resumed_by_several_processes(tmp_path, monkeypat
 
 
 @pytest.mark.parametrize("change", [pytest.param("another learning", marks=pytest.mark.slow), "another iteration"])
-def test_a_part_that_was_not_written_with_the_checkpoint_is_not_taken(tmp_path, monkeypatch, change):
+def test_a_part_that_was_not_written_with_the_checkpoint_is_not_taken(tmp_path, of_two, change):
     """An earlier branch left it, and the run was killed before this one's second process had written."""
-    path, _ = of_two(tmp_path, monkeypatch)
+    path, _ = of_two()
     old = rank_file(path, 1).read_bytes()
     if change == "another learning":
-        path, _ = of_two(tmp_path, monkeypatch, said=change)
+        path, _ = of_two(said=change)
     else:
         path = path.rename(tmp_path / "model_7.pt")
         entries = torch.load(path, weights_only=True)
@@ -218,21 +238,22 @@ def engine(name):
     return {"engine": name, "version": "1", "settings": {"timestep": 0.005}}
 
 
-def learned_in(runner, *names, tuned=()):
-    """Let a run say in which engines it trains and which score it."""
+def learned_in(folder, *names, tuned=()):
+    """A run that says in which engines it trains and which score it."""
+    runner = TrainingRunner(ToyEnv(), toy_configuration(), contract=toy_contract(), task="toy", log_dir=folder)
     physics = {"trained": [*map(engine, names)], "tuned": [*map(engine, tuned)]}
     runner.contract = replace(runner.contract, provenance={**runner.contract.provenance, "physics": physics})
     return runner
 
 
 def test_a_policy_remembers_the_physics_of_all_its_trainings(tmp_path):
-    for folder in ("one", "two", "three", "four"):
+    for folder in ("one", "two", "three"):
         (tmp_path / folder).mkdir()
-    learned_in(build(tmp_path / "one"), "warp", tuned=["mujoco"]).learn(1)
-    second = learned_in(build(tmp_path / "two"), "newton")
+    learned_in(tmp_path / "one", "warp", tuned=["mujoco"]).learn(1)
+    second = learned_in(tmp_path / "two", "newton")
     begin_with(second, tmp_path / "one" / "model_1.pt")
     second.learn(1)
-    resumed = learned_in(build(tmp_path / "three"), "newton", tuned=["mujoco"])
+    resumed = learned_in(tmp_path / "three", "newton", tuned=["mujoco"])
     resume_run(resumed, tmp_path / "two" / "model_1.pt")
     resumed.learn(1)
     physics = training_physics(load_policy(tmp_path / "three" / "model_2.pt").contract)
@@ -241,9 +262,8 @@ def test_a_policy_remembers_the_physics_of_all_its_trainings(tmp_path):
 
 
 def test_a_policy_that_began_with_one_of_unknown_physics_says_so(tmp_path):
-    (tmp_path / "one").mkdir()
-    build(tmp_path / "one").learn(1)
-    second = learned_in(build(), "newton")
-    begin_with(second, tmp_path / "one" / "model_1.pt")
+    TrainingRunner(ToyEnv(), toy_configuration(), contract=toy_contract(), task="toy", log_dir=tmp_path).learn(1)
+    second = learned_in(None, "newton")
+    begin_with(second, tmp_path / "model_1.pt")
     physics = training_physics(second.contract)
     assert [e.engine for e in physics.trained] == ["newton"] and "began with does not say" in physics.note
