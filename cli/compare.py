@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,12 +24,23 @@ def run_comparison(
 ) -> None:
     """Compare, show progress, print which differences are real and where the files are."""
     request = Request(policy=contestants[0], **vars(choices))
+    work = partial(compare_all, contestants, request)
+    show_comparison(work, f"compare-{joined_names(contestants)}", out=out, json_output=json_output)
+
+
+def show_comparison(
+    work: Callable[..., tuple[dict[str, Any], dict[str, Path]]], name: str, *, out: Path | None, json_output: bool
+) -> None:
+    """Do the work of a comparison, show progress, print which differences are real and where the files are.
+
+    Args:
+        work: takes the options of ``compare_all`` from ``folder`` on.
+        name: of the folder by default.
+    """
     console = Terminal(stderr=True)
     with resumable(console, "gauging") as display:
-        found, paths = compare_all(
-            contestants,
-            request,
-            folder=out or Path("results") / f"compare-{joined_names(contestants)}",
+        found, paths = work(
+            folder=out or Path("results") / name,
             overwrite=out is not None,
             runs=out or Path("results"),
             command=["gaitgauge", *sys.argv[1:]],

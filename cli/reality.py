@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,24 +16,24 @@ from ..studies.reality.preflight import preflight
 from ..studies.reality.replaying import label_of, replay
 from ..studies.reality.request import IdentifyRequest, PreflightRequest, ReplayRequest
 from ..studies.reality.scoring import score_sets
-from .compare import print_comparison
+from .compare import show_comparison
 from .console import Terminal, make_table, print_json
 from .errors import UserError
-from .evaluate import shower
-from .progress import ProgressDisplay
-from .studies import own_folder, resumable, show_turn
+from .studies import own_folder, study_in
 
 
 def run_replay(request: ReplayRequest, *, out: Path | None, json_output: bool) -> None:
     """Replay logs, print a table for each and where the files are."""
     folder = out or Path("results") / f"replay-{_names(request.logs)}"
-    _make("replay", replay, print_replay, request, folder, json_output)
+    name, data = "replay", "replay.json"
+    study_in(folder, name, name, replay, print_replay, request, data=data, json_output=json_output)
 
 
 def run_identify(request: IdentifyRequest, *, out: Path | None, json_output: bool) -> None:
     """Identify a robot, print its constants, what the logs do not tell, and residuals beside nominal ones."""
     folder = out or Path("results") / f"identify-{_names(request.logs)}"
-    _make("identify", identify_robot, print_identified, request, folder, json_output)
+    name, data = "identify", "identify.json"
+    study_in(folder, name, name, identify_robot, print_identified, request, data=data, json_output=json_output)
     if not json_output:
         Terminal().say(f"set      {folder / request.name}.toml")
 
@@ -65,49 +65,8 @@ def run_measured(
     if choices.parameters is not None:
         raise UserError("--parameters is not for this command; name the parameter sets behind the policy")
     request = Request(policy=policy, **vars(choices))
-    console = Terminal(stderr=True)
-    with resumable(console, "gauging") as display:
-        found, paths = score_sets(
-            request,
-            sets,
-            folder=out or Path("results") / f"measured-{joined_names([policy])}",
-            overwrite=out is not None,
-            runs=out or Path("results"),
-            command=["gaitgauge", *sys.argv[1:]],
-            watch=shower(display),
-            say=console.say,
-        )
-    if json_output:
-        print_json(found)
-        return
-    output = Terminal()
-    print_comparison(output, found)
-    for kind, path in paths.items():
-        output.say(f"{kind:5}{path}")
-
-
-def _make(
-    name: str,
-    study: Callable[..., Mapping[str, Any]],
-    show: Callable[[Terminal, Mapping[str, Any]], None],
-    request: Any,
-    folder: Path,
-    json_output: bool,
-) -> None:
-    errors = Terminal(stderr=True)
-    with own_folder(folder), ProgressDisplay(errors, name) as display:
-        results = study(
-            request,
-            folder,
-            command=["gaitgauge", *sys.argv[1:]],
-            watch=partial(show_turn, display),
-        )
-    if json_output:
-        print_json(results)
-        return
-    console = Terminal()
-    show(console, results)
-    console.say(f"results  {folder / name}.json\npage     {folder / name}.html")
+    work = partial(score_sets, request, sets)
+    show_comparison(work, f"measured-{joined_names([policy])}", out=out, json_output=json_output)
 
 
 def _names(logs: Sequence[Path]) -> str:

@@ -70,6 +70,40 @@ def show_turn(display: ProgressDisplay, turn: Turn) -> None:
     display.update(turn.share, text, left=turn.seconds_left)
 
 
+def study_in(
+    folder: Path,
+    name: str,
+    title: str,
+    study: Callable[..., Mapping[str, Any]],
+    show: Callable[[Terminal, Mapping[str, Any]], None],
+    request: Any,
+    *,
+    data: str,
+    json_output: bool,
+    check: Callable[[], None] = lambda: None,
+) -> Mapping[str, Any]:
+    """Make a study in a folder of its own, print it and its files; return its results.
+
+    Args:
+        name: its page is ``<name>.html``.
+        title: of the progress display.
+        data: name of the file of its results.
+        check: called in the locked folder before anything is played.
+    """
+    # the folder first: an error in it is shown before anything is played
+    with own_folder(folder), ProgressDisplay(Terminal(stderr=True), title) as display:
+        check()
+        command = ["gaitgauge", *sys.argv[1:]]
+        results = study(request, folder, command=command, watch=partial(show_turn, display))
+    if json_output:
+        print_json(results)
+    else:
+        console = Terminal()
+        show(console, results)
+        console.say(f"results  {folder / data}\npage     {folder / name}.html")
+    return results
+
+
 def make_study(
     name: str,
     data: str,
@@ -92,23 +126,13 @@ def make_study(
     usual = Path("results") / f"{name}-{joined_names(request.policies)}"
     folder = out or free_folder(usual, lambda path: lost_policy(path / data, files) is None)
     request = replace(request, policies=policy_files(request.policies))
-    errors = Terminal(stderr=True)
-    # the folder first: an error in it is shown before anything is played
-    with own_folder(folder), ProgressDisplay(errors, title) as display:
+
+    def check() -> None:
         if lost := lost_policy(folder / data, files):
             raise UserError(f"'{folder}' holds policy {lost}, which would be lost; give another folder with --out")
-        results = study(
-            request,
-            folder,
-            command=["gaitgauge", *sys.argv[1:]],
-            watch=partial(show_turn, display),
-        )
-    if json_output:
-        print_json(results)
-    else:
-        console = Terminal()
-        show(console, results)
-        console.say(f"results  {folder / data}\npage     {folder / name}.html")
+
+    results = study_in(folder, name, title, study, show, request, data=data, json_output=json_output, check=check)
+    errors = Terminal(stderr=True)
     for refused in results["refused"]:
         errors.say(f"{refused['what']} was left out: {refused['reason']}")
     if results["refused"]:
