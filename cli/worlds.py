@@ -7,13 +7,14 @@ from contextlib import ExitStack
 from typing import Any
 
 from ..backends.registry import choose_device
+from ..gauge.ground_rules import build_terrain
 from ..gauge.suite import load_suite
 from ..policy.base import Policy
 from ..policy.loading import own_contract
 from ..robots import Robot
 from ..studies.naming import distinct_names
 from ..terrains.gauge_terrains import LEVELS
-from ..terrains.registry import gauge_terrain_names, make_terrain
+from ..terrains.registry import gauge_terrain_names
 from .play_session import PlaySession
 from .policies import open_policy
 from .requests import PlayRequest
@@ -35,7 +36,6 @@ class WorldMaker:
 
     def make(self, choice: str, terrain: str, level: int | None, friction: float, label: str) -> PlaySession:
         """Return a robot with a policy on a terrain. Raises PolicyError, ContractError, TerrainError, BackendError, UserError."""
-        ground = make_terrain(terrain, level)
         if choice not in self._policies:
             self._policies[choice] = open_policy(
                 choice,
@@ -44,6 +44,7 @@ class WorldMaker:
                 contract_file=own_contract(choice, self._request.contract),
             )
         policy, robot = self._policies[choice]
+        ground = build_terrain(self._settings["suite"].ground, robot, terrain, level)
         return PlaySession(policy, robot, ground, friction=friction, label=label, **self._settings)
 
     def make_all(self, policies: Sequence[str], terrain: str, level: int | None, friction: float) -> list[PlaySession]:

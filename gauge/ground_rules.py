@@ -24,7 +24,7 @@ class GroundRules:
     """Heights of each terrain family as a share of those that the published terrains have in this measure."""
 
 
-def build_terrain(rules: GroundRules | None, robot: Robot, name: str, level: int) -> Terrain:
+def build_terrain(rules: GroundRules | None, robot: Robot, name: str, level: int | None) -> Terrain:
     """Return a terrain for a robot: in its own measure where a suite has such rules, else as published.
 
     Raises:
@@ -33,7 +33,7 @@ def build_terrain(rules: GroundRules | None, robot: Robot, name: str, level: int
     if rules is None:
         return make_terrain(name, level)
     rise = rules.rise.get(name.partition("_")[0], 1.0)
-    return measured_terrain(name, level, leg=body_plan(robot).leg_length, rise=rise)
+    return measured_terrain(name, level or 0, leg=body_plan(robot).leg_length, rise=rise)
 
 
 def heavier(rules: GroundRules | None, robot: Robot) -> float:
