@@ -1,10 +1,11 @@
 """Scores public policies of other projects on level ground, each at commands within what it was made for, and prints a table.
 
-    python benchmarks/public_policies/board.py FOLDER [--robots MODELS] [--threads N] [--out results/public] [--only TEXT]
+    python benchmarks/public_policies.py FOLDER [--robots MODELS] [--suite SUITE] [--threads N] [--out results/public] [--only TEXT]
 
 ``FOLDER`` has one folder for each policy, with the files that its authors ship beside it. ``MODELS`` has the makers' MuJoCo models of
 robots that do not ship with gaitgauge (``b2.xml``, ``g1_12dof.xml``, ``g1_29dof.xml``, ``h1.xml``); meshes are left out and
-missing trunks and soles become boxes.
+missing trunks and soles become boxes. ``OUT/board.md`` has a table for each robot. ``--suite benchmarks/public_contracts/gentle.toml``
+asks for half of each policy's limits and pushes nothing.
 """
 
 from __future__ import annotations
@@ -173,7 +174,7 @@ def score(file: Path, folder: Path, options: argparse.Namespace) -> Row:
         row.assumed, row.robot = str(provenance.get("assumed", "")), policy.contract.robot
         row.limits = policy.contract.command_limits
         request = Request(
-            policy=str(file), robot=robot, contract=contract, suite=str(HERE / "suite.toml"), threads=options.threads
+            policy=str(file), robot=robot, contract=contract, suite=str(options.suite), threads=options.threads
         )
         result: Result = evaluate(prepare(request), options.out / name, resume=True)
         row.score, row.falls = result.terrains["flat"].score, result.health.falls
@@ -188,11 +189,25 @@ def cell(value: Any) -> str:
     return "" if value is None else f"{value:.3f}" if isinstance(value, float) else str(value).replace("|", "/")
 
 
+def boards(rows: list[Row]) -> str:
+    """Return a table for each robot, best policies first, those without a score last."""
+    lines = []
+    for robot in sorted({row.robot for row in rows if row.robot}):
+        lines += [f"## {robot}", "", "| policy | score | falls | limits | assumed |", "| --- | --- | --- | --- | --- |"]
+        for row in sorted((r for r in rows if r.robot == robot), key=lambda r: -1.0 if r.score is None else -r.score):
+            limits = ", ".join(f"{v:g}" for v in row.limits)
+            columns = (row.file.partition("/")[0], row.score, row.falls, limits, row.problem or row.assumed)
+            lines.append("| " + " | ".join(cell(v) for v in columns) + " |")
+        lines.append("")
+    return "\n".join(lines)
+
+
 def main() -> None:
     """Score the policies and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--robots", type=Path)
+    parser.add_argument("--suite", default=HERE / "suite.toml", help="a suite with one terrain, flat")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--out", type=Path, default=Path("results/public"))
     parser.add_argument("--only", default="", help="part of the names of the policies' folders")
@@ -212,6 +227,7 @@ def main() -> None:
         columns = (row.file, row.read, row.robot, limits, row.score, row.falls, row.problem or row.assumed)
         print("| " + " | ".join(cell(v) for v in columns) + " |", flush=True)
         options.out.mkdir(parents=True, exist_ok=True)
+        (options.out / "board.md").write_text(boards(rows))
         (options.out / "board.json").write_text(json.dumps([vars(r) for r in rows], indent=2))
 
 

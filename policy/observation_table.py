@@ -231,7 +231,6 @@ _OWN = (
         width=1,
         unit="m",
         noise="height_scan",
-        foreign_names=("height_scan", "height_scanner"),
         exteroceptive=True,
     ),
     Observation(
