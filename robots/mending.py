@@ -12,6 +12,8 @@ if TYPE_CHECKING:
     import mujoco
 
 _GRAVITY = (0.0, 0.0, -9.81)
+_COLLISION_GROUP = 3
+"""Group of shapes that collide, by custom."""
 
 
 def mend(path: Path, spec: mujoco.MjSpec, model: mujoco.MjModel) -> list[str]:
@@ -30,14 +32,16 @@ def mend(path: Path, spec: mujoco.MjSpec, model: mujoco.MjModel) -> list[str]:
         at = next((i for i, line in enumerate(lines, 1) if re.search(pattern, line)), None)
         mends.append(f"{path.name}{f', line {at}' if at else ''}: {sentence}")
 
-    free = [j for j in spec.joints if j.type == mujoco.mjtJoint.mjJNT_FREE]
-    for joint in free:
-        dof = int(model.jnt_dofadr[joint.id])
+    # elements of a spec that was not compiled have no ids; they stand in the order of the compiled ones
+    free = [(i, joint) for i, joint in enumerate(spec.joints) if joint.type == mujoco.mjtJoint.mjJNT_FREE]
+    roots = [body for body in range(1, model.nbody) if model.body_parentid[body] == 0]
+    for place, joint in free:
+        dof = int(model.jnt_dofadr[place])
         passive = {
             "damping": model.dof_damping[dof],
             "friction loss": model.dof_frictionloss[dof],
             "armature": model.dof_armature[dof],
-            "stiffness": model.jnt_stiffness[joint.id],
+            "stiffness": model.jnt_stiffness[place],
         }
         if found := [f"{kind} {value:g}" for kind, value in passive.items() if value]:
             joint.damping, joint.stiffness = 0.0 * joint.damping, 0.0 * joint.stiffness
@@ -57,9 +61,9 @@ def mend(path: Path, spec: mujoco.MjSpec, model: mujoco.MjModel) -> list[str]:
     for site in list(spec.worldbody.sites):
         note(f"the site '{site.name}' of the world is none of the robot: taken out", _named("site", site.name))
         spec.delete(site)
-    base = model.body_rootid[model.jnt_bodyid[free[0].id]] if len(free) == 1 else -1
-    for body in list(spec.worldbody.bodies):
-        if base >= 0 and model.body_rootid[body.id] != base:
+    base = int(model.body_rootid[model.jnt_bodyid[free[0][0]]]) if len(free) == 1 else -1
+    for root, body in zip(roots, list(spec.worldbody.bodies), strict=True):
+        if base >= 0 and root != base:
             note(
                 f"the body '{body.name}' hangs on the world and not on the robot: taken out", _named("body", body.name)
             )
@@ -85,7 +89,26 @@ def mend(path: Path, spec: mujoco.MjSpec, model: mujoco.MjModel) -> list[str]:
     for body in light:
         note(f"the body '{body.name}' has gravity compensation: taken out", r"gravcomp=")
         body.gravcomp = 0.0
+    mends += _mend_shapes(path, spec)
     return mends + _mend_motors(path, spec, model)
+
+
+def _mend_shapes(path: Path, spec: mujoco.MjSpec) -> list[str]:
+    """Let shapes meet the ground in a model where none does, since its scene pairs them: those of group 3, else all primitives."""
+    import mujoco
+
+    if any((geom.contype | geom.conaffinity) & 1 for geom in spec.geoms):
+        return []
+    physical = [g for g in spec.geoms if g.type != mujoco.mjtGeom.mjGEOM_MESH or g.group == _COLLISION_GROUP]
+    chosen = [g for g in physical if g.group == _COLLISION_GROUP] or physical
+    for geom in chosen:
+        geom.conaffinity = 1
+    told = "no shape meets the ground (contype and conaffinity are 0 everywhere)"
+    return (
+        [f"{path.name}: {told}: {len(chosen)} shapes given conaffinity 1, so that they do, but not each other"]
+        if chosen
+        else []
+    )
 
 
 def _mend_motors(path: Path, spec: mujoco.MjSpec, model: mujoco.MjModel) -> list[str]:

@@ -15,7 +15,9 @@ from stick_biped import ARMS_MASS, MASS, write_biped
 from stick_robot import PLATE, SHANKS, write_stick
 
 PASSIVE = '<default><joint damping="0.3" armature="0.01"/></default>'
-FLOOR = '<worldbody><geom name="floor" type="plane" size="1 1 1"/>'
+FLOOR = (
+    '<worldbody><geom name="floor" type="plane" size="1 1 1"/><body name="table" pos="2 0 0"><geom size="0.1"/></body>'
+)
 LYING = "0 0 0.1 1 0 0 0" + " 0 0 -1.4 2.4 -0.9 0" * 2
 STANDING = "0 0 0.6 1 0 0 0" + " 0 0 -0.2 0.4 -0.2 0" * 2
 
@@ -37,8 +39,9 @@ def test_a_humanoid_is_described_with_mends(tmp_path):
     free, floor = (next(i for i, line in enumerate(lines, 1) if word in line) for word in ('type="free"', "floor"))
     draft, robot = described(model)
     assert draft.plan == "a biped with arms, with legs that end in l_f, r_f"
-    assert [m.split(":")[0] for m in draft.mends] == [f"stickman.xml, line {free}", f"stickman.xml, line {floor}"]
-    assert "damping 0.3, armature 0.01" in draft.mends[0] and "'floor'" in draft.mends[1]
+    assert [m.split(":")[0] for m in draft.mends] == [f"stickman.xml, line {line}" for line in (free, floor, floor)]
+    for mend, told in zip(draft.mends, ("damping 0.3, armature 0.01", "'floor'", "'table'"), strict=True):
+        assert told in mend
     assert robot.soles == tuple(tuple(f"{side}_f_foot{end}" for end in ("", "_2", "_3", "_4")) for side in ("l", "r"))
     assert body_plan(robot).mass == pytest.approx(MASS + ARMS_MASS)
     findings = {f.check: f for f in examine(robot)}
@@ -175,3 +178,13 @@ def test_values_of_joints_stand_under_words_of_names(values, table):
         np.testing.assert_array_equal(found, values)
     else:
         assert made == table
+
+
+def test_shapes_that_a_scene_pairs_with_the_ground_meet_it(tmp_path):
+    """They meet the ground and not each other; the trunk's is the largest."""
+    model = write_biped(tmp_path, default='<default><geom contype="0" conaffinity="0"/></default>')
+    draft, robot = described(model)
+    assert any("given conaffinity 1" in mend for mend in draft.mends)
+    physics, _ = default_pose(robot)
+    assert (physics.geom_conaffinity == 1).all() and not physics.geom_contype.any()
+    assert {len(sole) for sole in robot.soles} == {5}, "four balls, and the box 12 mm above their underside"
