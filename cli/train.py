@@ -57,7 +57,7 @@ def run_training(request: TrainRequest, time: str | None) -> None:
         if code := start_processes(count, sys.argv[1:]):
             raise typer.Exit(code)
         return
-    task = request.task
+    task = plan.request.task  # a ground and a robot have become a task
     # Of several processes, one for each GPU, the first prints.
     console = Terminal(quiet=os.environ.get("RANK", "0") != "0", may_lose=True)
     steps = plan.task.training.run.steps_per_iteration * plan.task.environment.num_envs

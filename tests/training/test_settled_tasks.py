@@ -5,6 +5,8 @@ from pathlib import Path
 
 import pytest
 from gaitgauge.training.configuration import to_plain
+from gaitgauge.training.run.plan import prepare
+from gaitgauge.training.run.request import TrainRequest
 from gaitgauge.training.tasks import TaskError, find_task
 
 
@@ -49,6 +51,13 @@ def test_a_ground_and_a_robot_are_a_task(ground, robot, task):
     assert find_task(ground, robot=robot) == find_task(task, robot=robot)
     if robot is not None:
         assert find_task(ground, [f"environment.robot={robot}"]) == find_task(task, robot=robot)
+
+
+def test_a_run_goes_by_the_task_that_a_ground_became():
+    request = TrainRequest(
+        task="walk", robot="g1", backend="mujoco", device="cpu", overrides=("environment.num_envs=8",)
+    )
+    assert prepare(request).request.task == "g1-walk"
 
 
 @pytest.mark.parametrize(

@@ -46,14 +46,21 @@ class PoseWeights:
     """Weight of each joint in ``pose`` by its role, which ``robots.anatomy`` tells from the model."""
 
     hip_roll: float = 1.0
+    """Legs to the side."""
     hip_pitch: float = 0.0
+    """Thighs forward and back."""
     hip_yaw: float = 1.0
+    """Feet that point inwards or outwards."""
     knee: float = 0.0
-    ankle: float = 0.0
+    """Knees."""
+    ankle: float = 1.0
+    """Ankles, in pitch, roll and yaw."""
     waist: float = 1.0
+    """Waist, in pitch, roll and yaw."""
     arm: float = 1.0
     """Shoulders, elbows, wrists and hands."""
     head: float = 1.0
+    """Head and neck."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -72,7 +72,9 @@ _WALK = EnvironmentConfiguration(
     joints=JointConfiguration(driven=("hip", "knee", "ankle"), rigid=True),
     gait=GaitConfiguration(period=0.8, swing_share=0.45, swing_height=0.09),
     # half as much again as gaitgauge-biped-1 adds
-    observations=ObservationConfiguration(noise=NoiseConfiguration(base_angular_velocity=0.3, joint_velocity=2.0)),
+    observations=ObservationConfiguration(
+        noise=NoiseConfiguration(base_angular_velocity=0.3, joint_velocity=2.0), height_offset=0.75
+    ),
     rewards=_REWARDS,
     commands=CommandConfiguration(
         stages=(
