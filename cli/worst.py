@@ -14,7 +14,7 @@ from .console import Terminal, make_table, print_json
 from .errors import UserError
 from .picture import Quality, choose_renderer
 from .policies import policy_files
-from .progress import ProgressDisplay, duration
+from .progress import ProgressDisplay
 from .studies import resumable
 
 _FILMED = 0.15
@@ -68,9 +68,8 @@ def _quality(console: Terminal) -> Quality | None:
 
 
 def _show(display: ProgressDisplay, status: WorstStatus) -> None:
-    left = f"about {duration(status.seconds_left)} left"
     details = {"plays": str(status.played), "falls": str(status.fallen)}
-    display.update(status.share, f"{status.stage}: {left}", details)
+    display.update(status.share, status.stage, details, left=status.seconds_left)
 
 
 def print_worst(console: Terminal, results: Mapping[str, Any]) -> None:

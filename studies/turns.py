@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+from ..gauge.play.progress import Status
 from ..gauge.play.remaining import Stage, Stages
 
 _INTERVAL = 0.2
@@ -27,6 +28,39 @@ class Turn:
 
 
 Watch = Callable[[Turn], None]
+
+
+class EvaluationTurns:
+    """Adds to the remaining time of an evaluation that of those that follow it: each is taken for as long as those before."""
+
+    def __init__(
+        self,
+        watch: Callable[[Status], None] | None,
+        count: int,
+        *,
+        clock: Callable[[], float] = time.perf_counter,
+    ) -> None:
+        """Prepare; ``count``: number of evaluations."""
+        self._watch, self._clock, self._began = watch, clock, clock()
+        self._stages = Stages([Stage("", 1.0)] * count, in_seconds=False)
+        self._number, self._played = -1, False
+
+    def begin(self) -> Callable[[Status], None] | None:
+        """Begin the next evaluation; return what it calls with its progress."""
+        if self._number >= 0:
+            self._stages.end(self._clock(), counts=self._played)
+        self._number, self._played = self._number + 1, False
+        self._stages.begin(self._number, self._clock())
+        return None if self._watch is None else self._look
+
+    def _look(self, status: Status) -> None:
+        assert self._watch is not None
+        self._played = True
+        now, own = self._clock(), status.seconds_left
+        left = None if own is None else self._stages.left(now, own=own)
+        whole = now - self._began + (left or 0.0)
+        share = 1.0 if left is None or whole <= 0.0 else left / whole
+        self._watch(replace(status, seconds_left=left, remaining_work=share))
 
 
 class Turns:

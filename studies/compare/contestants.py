@@ -17,6 +17,7 @@ from ...policy.finding import find_policy
 from ...policy.loading import own_contract
 from ...robots.loading import robot_digest
 from ..naming import distinct_names, free_run_folder, run_folders
+from ..turns import EvaluationTurns
 from .comparison import ComparisonError, check_alike, check_different, compare, load_result
 from .report import write_comparison
 
@@ -84,8 +85,10 @@ def compare_all(
     labelled = {
         c: f"{c}/{result.policy.path}" for c, result in found.items()
     }  # a card's own name where its policy has none
+    turns = EvaluationTurns(watch, len(requests))
     for contestant, target in zip(requests, folders, strict=True):
-        found[contestant] = evaluate(prepared_requests[contestant], target, resume=True, command=command, watch=watch)
+        prepared = prepared_requests[contestant]
+        found[contestant] = evaluate(prepared, target, resume=True, command=command, watch=turns.begin())
         write_report(target)
     labels = distinct_names([labelled.get(c, found[c].policy.path) for c in contestants])
     comparison = compare([found[c] for c in contestants], labels)

@@ -14,6 +14,7 @@ from ..compare.comparison import compare
 from ..compare.contestants import deciding_request
 from ..compare.report import write_comparison
 from ..naming import free_run_folder, run_folders
+from ..turns import EvaluationTurns
 from .log import LogError
 
 
@@ -51,11 +52,11 @@ def score_sets(
         )
     request = deciding_request(request, say)
     prepared = [prepare(replace(request, parameters=name)) for name in sets]
-    results = []
+    results, turns = [], EvaluationTurns(watch, len(sets))
     for name, one in zip(sets, prepared, strict=True):
         usual = run_folders([request.policy], runs, suite=request.suite, pipeline=request.pipeline, parameters=name)[0]
         target = free_run_folder(usual, ("", identity(one)))
-        results.append(evaluate(one, target, resume=True, command=command, watch=watch))
+        results.append(evaluate(one, target, resume=True, command=command, watch=turns.begin()))
         write_report(target)
     robot = results[0].provenance.digests["robot"]  # one machine, whatever set stands for it
     alike = [

@@ -1,8 +1,11 @@
 """The remaining time of studies of several turns and several engines, on timelines."""
 
+import dataclasses
+
 import pytest
+from gaitgauge.gauge.play.progress import Status
 from gaitgauge.gauge.play.remaining import CPU_COST, Cost, Pace, Stage, Stages, Work
-from gaitgauge.studies.turns import Turns
+from gaitgauge.studies.turns import EvaluationTurns, Turns
 
 
 def errors(seconds, stages, *, in_seconds, ticks=20):
@@ -71,3 +74,21 @@ def test_turns_are_told_with_their_share_of_the_time():
     assert [(t.number, t.count, t.what) for t in told] == [(1, 2, "first"), (1, 2, "first"), (2, 2, "second")]
     assert [t.seconds_left for t in told] == [None, pytest.approx(35.0), pytest.approx(30.0)]
     assert told[2].share == pytest.approx(0.25)
+
+
+def test_a_comparison_counts_the_policies_that_follow():
+    """It told the time of the policy at work alone."""
+    now, told = 0.0, []
+    turns = EvaluationTurns(told.append, 3, clock=lambda: now)
+    status = Status(done=1, expected=9, active=(), seconds=0.0, seconds_left=None, remaining_work=1.0)
+    look = turns.begin()
+    look(status)
+    now = 20.0
+    look(dataclasses.replace(status, seconds_left=80.0))
+    now = 110.0
+    look = turns.begin()
+    look(dataclasses.replace(status, seconds_left=90.0))
+    now = 210.0
+    turns.begin()  # all of it was played before
+    assert [s.seconds_left for s in told] == [None, pytest.approx(280.0), pytest.approx(190.0, rel=0.05)]
+    assert told[1].remaining_work == pytest.approx(280.0 / 300.0)
