@@ -44,7 +44,7 @@ def record(arguments: Sequence[str]) -> dict[str, object]:
 
     Returns:
         ``seconds``: the command's duration; ``shown``: pairs of a time and the remaining time shown at it, both in seconds;
-        ``silence``: the longest time without a change of the screen [s]; ``code``: exit code.
+        ``silence``: the longest time without a change of the screen [s], ``silent_from``: its beginning; ``code``: exit code.
     """
     ours, theirs = pty.openpty()
     environment = os.environ | {"COLUMNS": "200", "TERM": "xterm"}
@@ -58,7 +58,7 @@ def record(arguments: Sequence[str]) -> dict[str, object]:
     )
     os.close(theirs)
     shown: list[tuple[float, float]] = []
-    last, silence, before = began, 0.0, b""
+    last, silence, before, since = began, 0.0, b"", 0.0
     while True:
         try:
             data = os.read(ours, 1 << 16)
@@ -69,16 +69,19 @@ def record(arguments: Sequence[str]) -> dict[str, object]:
         now = time.monotonic()
         text = _CODES.sub(b"", data)
         if text.strip() and text != before:
-            silence, last, before = max(silence, now - last), now, text
+            silence, since = max((silence, since), (now - last, last - began))
+            last, before = now, text
         for found in _LEFT.finditer(text.decode(errors="replace")):
             hours, minutes, seconds = (int(part or 0) for part in found.groups())
             shown.append((round(now - began, 2), 3600.0 * hours + 60.0 * minutes + seconds))
     code = process.wait()
     now = time.monotonic()
+    silence, since = max((silence, since), (now - last, last - began))
     return {
         "command": shlex.join(arguments),
         "seconds": round(now - began, 2),
-        "silence": round(max(silence, now - last), 2),
+        "silence": round(silence, 2),
+        "silent_from": round(since, 2),
         "shown": [pair for i, pair in enumerate(shown) if i == 0 or pair[0] - shown[i - 1][0] > 0.2],
         "code": code,
     }
@@ -107,7 +110,9 @@ def table(timelines: dict[str, dict[str, object]]) -> str:
         found = errors(timeline)
         cells = "".join(f"{'–':>7}" if e is None else f"{100 * e:>+6.0f}%" for e in found)
         worst = max((abs(e) for e in found if e is not None), default=float("nan"))
-        lines.append(f"{name:<14}{timeline['seconds']:>8.1f}{cells}{100 * worst:>7.0f}%{timeline['silence']:>7.1f} s")
+        lines.append(
+            f"{name:<14}{timeline['seconds']:>8.1f}{cells}{100 * worst:>7.0f}%{timeline['silence']:>7.1f} s from {timeline['silent_from']:.0f} s"
+        )
     return "\n".join(lines)
 
 
