@@ -110,9 +110,8 @@ def table(timelines: dict[str, dict[str, object]]) -> str:
         found = errors(timeline)
         cells = "".join(f"{'–':>7}" if e is None else f"{100 * e:>+6.0f}%" for e in found)
         worst = max((abs(e) for e in found if e is not None), default=float("nan"))
-        lines.append(
-            f"{name:<14}{timeline['seconds']:>8.1f}{cells}{100 * worst:>7.0f}%{timeline['silence']:>7.1f} s from {timeline['silent_from']:.0f} s"
-        )
+        quiet = f"{timeline['silence']:>7.1f} s from {timeline['silent_from']:.0f} s"
+        lines.append(f"{name:<14}{timeline['seconds']:>8.1f}{cells}{100 * worst:>7.0f}%{quiet}")
     return "\n".join(lines)
 
 

@@ -33,7 +33,7 @@ from .separation import Separation, principal_components, separation
 
 PAIRS = {"terrains": "forward on every terrain", "commands": "every command on all terrains"}
 """Classes of the two figures, as in the paper."""
-_WALKING = 0.75
+_WALKING = 0.85
 """Share of the time of a policy in which it walks; then its latents are told apart."""
 STRIDES = 10
 """Notes that a mean is taken over: a second, in which a robot takes two to three strides."""
