@@ -146,6 +146,9 @@ class Robot:
     The mean of the geoms' centres is the foot's position."""
     velocity_joints: _Names | None = None
     """Joints with targets of velocity [rad/s] instead of angle, as wheels have; None for none."""
+    most_sag: Annotated[float, Field(ge=0.0, le=0.5)] | None = None
+    """Largest way that the base may sink under the robot's weight, over leg length, where its gains are meant to let it; None for
+    0.1. For ``robot check`` alone: it does not count for the digest."""
     driven_joints: _Names | None = None
     """Joints that a policy drives, in the order that policies use; the others are held at ``default_joint_position`` with the
     gains of the parameter set. None for all of ``joint_names``."""

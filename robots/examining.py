@@ -77,7 +77,7 @@ def _findings(robot: Robot) -> str:
         note("foot shapes", partial(_foot_shapes, robot), "what is rewarded and judged of feet")
         note("parts", partial(_parts, robot), "a start at rest")
         note("pose", partial(folded, robot))
-        note("load", partial(sag, robot), "standing as the default pose says")
+        note("load", partial(sag, robot))
         two = len(robot.foot_names) == 2
         note(
             "standing", partial(balance if two else stand, robot), "standing without a policy" if two else "everything"

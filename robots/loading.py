@@ -36,6 +36,8 @@ _JOINT_ENDING = "_joint"
 PER_JOINT = tuple(f.name for f in fields(JointParameters) if f.name not in ("delay", "motor", "network", "measured"))
 """Fields of a parameter set with a value for each joint."""
 _MEASURED = ("stiffness_factor", "damping_factor", "target_offset", "delay", "network", "measured")
+_ASIDE = ("mjcf", "most_sag")
+"""Fields that do not count for a robot's digest."""
 _ADDED_LATER = ("foot_shapes", "action_scale", "imu_site", "driven_joints", "variants", "velocity_joints")
 """Fields that count for a robot's digest only where set, so that digests of older descriptions stay."""
 
@@ -146,7 +148,7 @@ def robot_digest(robot: Robot) -> str:
     Raises:
         RobotError: a file cannot be read.
     """
-    description = {k: v for k, v in asdict(robot).items() if k != "mjcf" and not (v is None and k in _ADDED_LATER)}
+    description = {k: v for k, v in asdict(robot).items() if k not in _ASIDE and not (v is None and k in _ADDED_LATER)}
     description["parameters"] = {
         name: {k: v for k, v in table.items() if k != "motor" and not (v is None and k in _MEASURED)}
         for name, table in description["parameters"].items()

@@ -120,14 +120,15 @@ def _left_standing(robot: Robot, *, upright: bool = False, ankles: Ankles | None
 
 
 def sag(robot: Robot) -> str:
-    """Hold the base level and let it sink on the legs: raise ``RobotError`` where it sinks by over a tenth of their length."""
+    """Hold the base level and let it sink on the legs; raise ``RobotError`` where it sinks further than the robot may."""
     stance, length = _left_standing(robot, upright=True), anatomy(robot).leg_length
-    sunk = stance.start - stance.height
-    told = f"the legs, {length:.3f} m long, let the base sink by {max(sunk, 0.0):.3f} m under its weight"
-    if sunk > MOST_SAG * length:
+    sunk, most = max(stance.start - stance.height, 0.0), MOST_SAG if robot.most_sag is None else robot.most_sag
+    told = f"the legs, {length:.3f} m long, let the base sink by {sunk:.3f} m under its weight"
+    if sunk > most * length:
         raise RobotError(
-            f"robot '{robot.name}': {told}, over a tenth of their length; raise the stiffness (and torque_limit) of "
-            f"parameters.{robot.default_parameters}, or stretch the legs in default_joint_position"
+            f"robot '{robot.name}': {told}, over {most:g} of their length; raise the stiffness (and torque_limit) of "
+            f"parameters.{robot.default_parameters}, stretch the legs in default_joint_position, or say that it is meant: most_sag = "
+            f"{math.ceil(100 * sunk / length) / 100:g}"
         )
     return told
 
