@@ -158,8 +158,9 @@ def test_links_lead_to_files(page):
 NIGHTLY = {
     "docs/guides/board.md": "tests/cli/test_verify_command.py",
     "docs/guides/consistency.md": "tests/cli/test_consistency_command.py",
+    "docs/start/first-training.md": "tests/cli/test_train.py",
 }
-"""Pages whose commands take a minute, and the fast tests that run these commands on smaller suites."""
+"""Pages with commands that take a minute or more, and the fast tests that run these commands on less."""
 RUN = [
     pytest.param(page, marks=pytest.mark.nightly if title(page) in NIGHTLY else ())
     for page in PAGES
