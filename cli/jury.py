@@ -16,10 +16,10 @@ from ..studies.jury.request import JuryRequest, JuryStatus
 from ..studies.jury.study import jury, prepare_jury
 from ..studies.jury.verdict import OFF, command_words
 from ..studies.naming import free_run_folder, joined_names
-from .console import Terminal, make_table, print_json
+from .console import Terminal, make_table
 from .policies import policy_files
 from .progress import ProgressDisplay
-from .studies import resumable
+from .studies import resumable, show_results
 
 
 def run_jury(request: JuryRequest, engines: str, *, out: Path | None, resume: bool, json_output: bool) -> None:
@@ -36,12 +36,7 @@ def run_jury(request: JuryRequest, engines: str, *, out: Path | None, resume: bo
         command = ["gaitgauge", *sys.argv[1:]]
         results = jury(prepared, folder, resume=resume, command=command, watch=lambda s: _show(display, s))
     page = write_page(folder)
-    if json_output:
-        print_json(results)
-    else:
-        output = Terminal()
-        print_jury(output, results)
-        output.say(f"results  {folder / 'jury.json'}\npage     {page}")
+    show_results(results, print_jury, folder / "jury.json", page, json_output=json_output)
     unable = {engine["engine"]: engine["reason"] for block in results["policies"] for engine in block["unable"]}
     for name, reason in unable.items():
         console.say(f"{name} did not play to the end: {reason}")

@@ -95,13 +95,25 @@ def study_in(
         check()
         command = ["gaitgauge", *sys.argv[1:]]
         results = study(request, folder, command=command, watch=partial(show_turn, display))
+    show_results(results, show, folder / data, folder / f"{name}.html", json_output=json_output)
+    return results
+
+
+def show_results(
+    results: Mapping[str, Any],
+    show: Callable[[Terminal, Mapping[str, Any]], None],
+    data: Path,
+    page: Path,
+    *,
+    json_output: bool,
+) -> None:
+    """Print results as JSON; else show them, and where their file and page are."""
     if json_output:
         print_json(results)
-    else:
-        console = Terminal()
-        show(console, results)
-        console.say(f"results  {folder / data}\npage     {folder / name}.html")
-    return results
+        return
+    console = Terminal()
+    show(console, results)
+    console.say(f"results  {data}\npage     {page}")
 
 
 def make_study(

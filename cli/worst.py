@@ -10,12 +10,12 @@ from typing import Any
 
 from ..studies.naming import joined_names
 from ..studies.worst.request import WorstRequest, WorstStatus
-from .console import Terminal, make_table, print_json
+from .console import Terminal, make_table
 from .errors import UserError
 from .picture import Quality, choose_renderer
 from .policies import policy_files
 from .progress import ProgressDisplay
-from .studies import resumable
+from .studies import resumable, show_results
 
 _FILMED = 0.15
 """Share of the budget that is left for films."""
@@ -51,12 +51,7 @@ def run_worst(
 
             results = film_failures(prepared, folder, quality, lambda share, text: display.update(share, text))
     page = write_page(folder)
-    if json_output:
-        print_json(results)
-    else:
-        output = Terminal()
-        print_worst(output, results)
-        output.say(f"results  {folder / 'worst.json'}\npage     {page}")
+    show_results(results, print_worst, folder / "worst.json", page, json_output=json_output)
 
 
 def _quality(console: Terminal) -> Quality | None:

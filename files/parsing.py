@@ -300,6 +300,20 @@ def build(
         raise _error(problem, kind, source, error, "false" if false_is_none else "") from problem
 
 
+def read_toml(path: Path, kind: type[Kind], what: str, error: type[Exception], *, source: str = "") -> Kind:
+    """Read a TOML file into a frozen dataclass.
+
+    Args:
+        what: of the file in the sentence (``suite file``), as for ``read_text``.
+        source: name in sentences on its content; the file's own by default.
+
+    Raises:
+        error: as ``read_text``, ``parse_toml`` and ``build``.
+    """
+    source = source or path.name
+    return build(kind, parse_toml(read_text(path, what, error), source, error), source, error)
+
+
 def take(kind: type[Kind], data: object, source: str, error: type[Exception]) -> Kind:
     """Build a dataclass from a table's entries that bear its fields' names, and so for the tables in it; raise ``error`` as ``build``."""
     if not isinstance(data, Mapping):

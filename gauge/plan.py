@@ -148,7 +148,7 @@ def _level_test(environment: Environment, level: int, records: Records, rules: P
     """How far the test of a level is."""
     suite = rules.suite
     seeds = suite.matrix.search_seeds
-    episodes = [_episode(environment, level, seed, "search", suite) for seed in seeds]
+    episodes = [episode_of(environment, level, seed, "search", suite) for seed in seeds]
     outcomes = [bool(records[e].success) if e in records else None for e in episodes]
     needed = math.ceil(suite.scoring.pass_rate * len(seeds) - 1e-9)
     most_failures = len(seeds) - needed
@@ -194,10 +194,11 @@ def _quality(environment: Environment, level: float, rules: PlanRules) -> list[E
     if not rules.quality:
         return []
     levels = [0] if environment.terrain == "flat" else list(bracketing_levels(level))
-    return [_episode(environment, at, seed, "eval", rules.suite) for at in levels for seed in rules.seeds]
+    return [episode_of(environment, at, seed, "eval", rules.suite) for at in levels for seed in rules.seeds]
 
 
-def _episode(environment: Environment, level: int, seed: int, stage: str, suite: Suite) -> Episode:
+def episode_of(environment: Environment, level: int, seed: int, stage: str, suite: Suite) -> Episode:
+    """Return an episode of a suite, with the goals of its stage."""
     return Episode(
         terrain=environment.terrain,
         level=level,
@@ -218,7 +219,7 @@ def _plan_expected(environment: Environment, records: Records, rules: PlanRules)
     seeds, levels = suite.matrix.search_seeds, suite.scoring.levels
 
     def trial(level: int, seed: int) -> Episode:
-        return _episode(environment, level, seed, "search", suite)
+        return episode_of(environment, level, seed, "search", suite)
 
     def outcomes(level: int) -> list[bool | None]:
         found = [records.get(trial(level, seed)) for seed in seeds]

@@ -15,9 +15,9 @@ import numpy as np
 
 from ..files.parsing import edited, one_line, shown
 from ..policy.contract import EXTEROCEPTIVE_TERMS, PRIVILEGED_TERMS
-from .episodes import QUALITY, Episode, Record
+from .episodes import QUALITY, Record
 from .pipelines import PIPELINES, Environment
-from .plan import PlanRules, plan
+from .plan import PlanRules, episode_of, plan
 from .result import BY_HAND, CONFIDENCE, ChanceRules, EnvironmentRow, Result, Run, RunHealth, Statistics, Table
 from .suite import Suite, load_suite
 from .totals import COUNTS, health_of, totals, whole_row
@@ -203,7 +203,7 @@ def _check_levels(rows: Sequence[EnvironmentRow], rules: ChanceRules, source: st
             episode: Record(episode=episode, success=success)
             for level, outcomes in row.trials.items()
             for seed, success in outcomes.items()
-            for episode in [_trial(environment, level, seed)]
+            for episode in [episode_of(environment, level, seed, "search", suite)]
         }
         found = plan(environment, records, PlanRules(suite=suite, seeds=rules.seeds, quality=False))
         if found.level is None:
@@ -233,18 +233,6 @@ def _suite_of(rules: ChanceRules) -> Suite:
         goals=(),
         matrix=replace(suite.matrix, search_seeds=rules.search_seeds),
         scoring=replace(suite.scoring, **{name: getattr(rules, name) for name in names}),
-    )
-
-
-def _trial(environment: Environment, level: int, seed: int) -> Episode:
-    return Episode(
-        terrain=environment.terrain,
-        level=level,
-        friction=environment.friction,
-        payload=environment.payload,
-        seed=seed,
-        stage="search",
-        goals=(),
     )
 
 

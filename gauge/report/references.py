@@ -8,7 +8,7 @@ from functools import cache
 from pathlib import Path
 from typing import Literal
 
-from ...files.parsing import Name, Share, Text, build, parse_toml, read_text
+from ...files.parsing import Name, Share, Text, read_toml
 from ..result import COMPLETE, Result
 
 ENGINE = "mujoco"
@@ -55,8 +55,7 @@ class ReferenceTable:
 @cache
 def reference_table() -> ReferenceTable:
     """Return the scores that ship with the project; raise ``ReferenceScoreError`` where the file is malformed."""
-    data = parse_toml(read_text(_FILE, "reference file", ReferenceScoreError), _FILE.name, ReferenceScoreError)
-    return build(ReferenceTable, data, _FILE.name, ReferenceScoreError)
+    return read_toml(_FILE, ReferenceTable, "reference file", ReferenceScoreError)
 
 
 def references_for(result: Result) -> Sequence[ReferenceScore]:

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from ...files.parsing import Name, Text, build, did_you_mean, parse_toml, read_text, shown
+from ...files.parsing import Name, Text, did_you_mean, read_toml, shown
 from ...robots import Robot, RobotError
 from ...robots.body_plan import body_plan
 from ..base import PolicyError
@@ -66,8 +66,7 @@ class _Presets:
 @cache
 def presets() -> Mapping[str, Preset]:
     """Return all presets by name, in the order of the file; raise ``PolicyError`` where the file is malformed."""
-    data = parse_toml(read_text(_FILE, "file of presets", PolicyError), _FILE.name, PolicyError)
-    return {each.name: each for each in build(_Presets, data, _FILE.name, PolicyError).preset}
+    return {each.name: each for each in read_toml(_FILE, _Presets, "file of presets", PolicyError).preset}
 
 
 def find_preset(name: str) -> Preset:

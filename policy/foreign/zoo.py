@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
-from ...files.parsing import Name, Text, build, parse_toml, read_text
+from ...files.parsing import Name, Text, read_toml
 from ...robots.base import Robot
 from ..base import PolicyError
 from ..contract import PolicyContract
@@ -61,8 +61,7 @@ class _Zoo:
 @cache
 def zoo() -> Mapping[str, KnownPolicy]:
     """Return all known policies by SHA-256, in the order of the file; raise ``PolicyError`` where the file is malformed."""
-    data = parse_toml(read_text(_FILE, "file of known policies", PolicyError), _FILE.name, PolicyError)
-    return {each.sha256: each for each in build(_Zoo, data, _FILE.name, PolicyError).policy}
+    return {each.sha256: each for each in read_toml(_FILE, _Zoo, "file of known policies", PolicyError).policy}
 
 
 def known_contract(known: KnownPolicy, asked: Robot | None) -> PolicyContract:

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from ...files.parsing import Text, build, did_you_mean, one_line, parse_toml, read_text, shown
+from ...files.parsing import Text, did_you_mean, one_line, read_text, read_toml, shown
 from ...robots import Robot, load_robot, robot_names
 from .log import HELD, Log, LogError, make_log
 
@@ -73,8 +73,7 @@ class LogMap:
 
 def read_map(path: Path) -> LogMap:
     """Read a map; raise ``LogError`` where it is missing or wrong."""
-    source = f"map '{one_line(path)}'"
-    return build(LogMap, parse_toml(read_text(path, "map", LogError), source, LogError), source, LogError)
+    return read_toml(path, LogMap, "map", LogError, source=f"map '{one_line(path)}'")
 
 
 def read_log(path: Path, *, robot: str | None = None, mapping: LogMap | None = None, held: str | None = None) -> Log:

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from ...files.parsing import Name, Text, build, did_you_mean, one_line, parse_toml, read_text
+from ...files.parsing import Name, Text, did_you_mean, one_line, read_toml
 from ...gauge.commands import Phase
 from ...gauge.suite import Friction, SuiteError, load_suite
 from ...terrains.base import Box, Terrain
@@ -256,8 +256,7 @@ def load_scenario(name: str) -> Scenario:
         )
     path = Path(name) if own else SCENARIO_FOLDER / f"{name}.toml"
     source = f"scenario file {one_line(path)}"
-    data = parse_toml(read_text(path, "scenario file", ScenarioError), source, ScenarioError)
-    scenario = build(Scenario, data, source, ScenarioError)
+    scenario = read_toml(path, Scenario, "scenario file", ScenarioError, source=source)
     for problem in _problems(scenario):
         raise ScenarioError(f"{source}: {problem}")
     if path.resolve().parent != SCENARIO_FOLDER.resolve() and scenario.name in scenario_names():

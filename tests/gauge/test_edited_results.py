@@ -249,7 +249,7 @@ def test_a_name_that_no_system_takes_is_one_sentence():
         (lambda: train(None), "task is None; it must be a text"),
         (lambda: train(["go2-flat"]), r"task is \['go2-flat'\]; it must be a text"),
         (lambda: train("go2-flat", 3), r"settings is \(3,\); it must be several texts"),
-        (lambda: train("go2-flat", treads=3), "there is no option treads; choose from backend, device, num_envs"),
+        (lambda: train("go2-flat", treads=3), "there is no option treads; choose from backend, device, gpus, num_envs"),
         (lambda: train("go2-flat", threads=0), "threads is 0; it must be greater than or equal to 1"),
         (lambda: train("go2-flat", threads=10**9), "threads is 1000000000; it must be less than or equal to 1024"),
         (lambda: train("go2-flat", seconds=float("nan")), "seconds is nan; it must be a finite number"),

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from ...files.parsing import Name, Seed, Text, build, one_line, parse_toml, read_text
+from ...files.parsing import Name, Seed, Text, one_line, read_toml
 from ...gauge.suite import SuiteError, load_suite
 
 NO_SUITE = "none"
@@ -87,7 +87,7 @@ class Sweep:
 def load_sweep(path: Path) -> Sweep:
     """Read a sweep's file. Raises SweepError: no such file, no valid TOML, a field that does not fit, or no such suite."""
     source = f"sweep file '{one_line(path)}'"
-    sweep = build(Sweep, parse_toml(read_text(path, "sweep file", SweepError), source, SweepError), source, SweepError)
+    sweep = read_toml(path, Sweep, "sweep file", SweepError, source=source)
     scores = {} if sweep.training_suite == NO_SUITE else {"training_suite": sweep.training_suite}
     for field, suite in ({"suite": sweep.suite} | scores).items():
         try:
