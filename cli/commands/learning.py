@@ -26,7 +26,7 @@ def train(
 
     Examples:
       gaitgauge train go2-moe-cts
-      gaitgauge train go2-flat --num-envs 2048 --time 1h30m
+      gaitgauge train rough --robot go1 --num-envs 2048 --time 1h30m
       gaitgauge train go2-moe-cts --init-from pretrained environment.push.linear=0.6
       gaitgauge train go2-moe-cts --resume latest
     """
