@@ -59,7 +59,7 @@ def write(path: Path, module: nn.Module) -> Path:
     ("kind", "inside"),
     [
         (InForward, False),
-        (InReset, False),
+        pytest.param(InReset, False, marks=pytest.mark.slow),
         (InSetstate, False),
         (InForward, True),
         pytest.param(InReset, True, marks=pytest.mark.slow),
