@@ -92,6 +92,8 @@ def test_an_engine_that_is_left_out_is_told(run, tmp_path, policy, tiny, monkeyp
         done = run(*command, "--out", tmp_path / "study", *more)
         assert done.exit_code == 0, done.output
         assert "mujoco-warp is left out" in done.stderr
+        assert "6 runs of 2 episodes take about" in done.stderr  # three engines, three draws of the floor
+        assert "in all it would take with --attribution about" in done.stderr and "--seeds 10 about" in done.stderr
         told = done.stderr if more else done.stdout
         assert "mujoco@cone=pyramidal is left out: it knows no pyramids" in told
         assert more or "mujoco-warp is left out" in done.stdout

@@ -26,6 +26,7 @@ from gaitgauge.studies.consistency import study as studying
 from gaitgauge.studies.consistency.attribution import choose_factors
 from gaitgauge.studies.consistency.closed_loop import Design, make_cells
 from gaitgauge.studies.consistency.page import render, verdict, write_page
+from gaitgauge.studies.consistency.prepared import default_engines
 from gaitgauge.studies.consistency.request import ConsistencyError, StudyRequest
 from gaitgauge.studies.consistency.statistics import Estimate
 from gaitgauge_fake_engine import FakeBackend, FakeScript
@@ -438,3 +439,21 @@ def test_every_episode_and_draw_of_the_floor_has_a_perturbation_of_its_own(reque
     states = set().union(*resets.values())
     # three draws; in each two seeds and every sub-command of two goals begin otherwise
     assert len(states) >= 3 * len(results["seeds"]) * 2
+
+
+@pytest.mark.parametrize(
+    ("gpu", "drake", "second"),
+    [(True, True, "mujoco-warp"), (False, True, "drake"), (False, False, "mujoco@foot_condim=3")],
+)
+def test_a_study_starts_light(monkeypatch, gpu, drake, second):
+    """On a CPU there was no result after 15 minutes: seven terrains, three engines that compile, ten factors."""
+
+    def find(name, device):
+        if not drake:
+            raise BackendError("drake is not installed")
+
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: gpu)
+    monkeypatch.setattr("gaitgauge.studies.consistency.prepared.find_backend", find)
+    assert default_engines() == ("mujoco", second)
+    request = StudyRequest(policies=("pretrained",))
+    assert (request.suite, request.seeds, request.attribution, request.factors) == ("jury", 3, False, ())
