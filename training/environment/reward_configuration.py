@@ -143,9 +143,6 @@ class RewardShapes:
 
     tracking_sigma: Positive = 0.25
     """Width of the tracking kernels, exp(-error²/sigma) [m²/s² and rad²/s²]."""
-    yaw_sigma: Positive | None = None
-    """Width of the kernel of the yaw rate [rad²/s²], where it is another one; None for ``tracking_sigma``. A biped's pelvis turns to and
-    fro with every step."""
     dynamic_sigma: bool = True
     """Let sigma grow with command and terrain level (paper, dynamic velocity tracking precision adjustment)."""
     sigma_linear_range: Range = (0.5, 1.5)

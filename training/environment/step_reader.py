@@ -83,7 +83,6 @@ class StepReader:
         self._difficulty = (torch.exp(levels * 0.1) - 1.0).clamp(max=1.0)
         rising = torch.tensor((r.sigma_linear_range, r.sigma_linear_range, r.sigma_yaw_range), device=device)
         self._sigma_low, self._sigma_rate = rising[:, 0], 1.0 / (rising[:, 1] - rising[:, 0])
-        self._axes = torch.tensor((1.0, 1.0, (r.yaw_sigma or 0.0) / r.tracking_sigma), device=device)
         leave = configuration.terrain.leave_distance
         distance = [leave if leave is not None and tile.ends else math.inf for tile in tiles]
         self._leave = torch.tensor(distance, device=device)[kind]
@@ -107,11 +106,9 @@ class StepReader:
         base = self._settings.tracking_sigma
         command = memory.command
         if not self._settings.dynamic_sigma:
-            width = torch.full_like(command, base)
-        else:
-            speed = ((command.abs() - self._sigma_low) * self._sigma_rate).clamp(0.0, 1.0)
-            width = base + speed * (self._difficulty[memory.level] * self._sigma_growth)[:, None]
-        return width if self._settings.yaw_sigma is None else width * self._axes
+            return torch.full_like(command, base)
+        speed = ((command.abs() - self._sigma_low) * self._sigma_rate).clamp(0.0, 1.0)
+        return base + speed * (self._difficulty[memory.level] * self._sigma_growth)[:, None]
 
     def _commanded_heading(self, memory: EnvironmentMemory, heading_xy: torch.Tensor) -> torch.Tensor:
         """Return ``StepInputs.commanded_heading_xy``, where ``heading_xy`` are the robots' own."""

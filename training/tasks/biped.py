@@ -32,7 +32,6 @@ from ..environment.terrain_configuration import TerrainConfiguration, TileConfig
 _REWARDS = RewardConfiguration(
     linear_tracking=2.0,
     yaw_tracking=1.0,
-    yaw_sigma=0.5,
     # From a standstill the kernel of a fast command is flat.
     progress=0.5,
     alive=1.0,
@@ -87,7 +86,7 @@ _WALK = EnvironmentConfiguration(
     ),
     reset=ResetConfiguration(joint_scale=(0.8, 1.2), velocity=0.3, footprint=(0.3, 0.4)),
     randomization=RandomizationConfiguration(
-        friction=(0.3, 1.25), base_mass=(-1.0, 2.0), base_com=(-0.04, 0.04), motor_strength=(0.9, 1.1)
+        friction=(0.3, 1.25), base_mass=(-1.0, 4.5), base_com=(-0.04, 0.04), motor_strength=(0.9, 1.1)
     ),
     push=PushConfiguration(linear=0.5),
     termination=TerminationConfiguration(trunk_contact=1.0, tilt=0.9, low=0.45),
