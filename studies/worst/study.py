@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
-import time
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
@@ -18,9 +16,9 @@ import torch
 from ...backends.base import BackendError
 from ...backends.registry import engine_class
 from ...files.choices import cpu_threads
-from ...files.parsing import parse_json, read_text, shown
+from ...files.parsing import shown
 from ...files.provenance import provenance
-from ...files.writing import json_text, lock_folder, make_folder, replacing, write_atomically
+from ...files.writing import json_text, write_atomically
 from ...gauge.suite import load_suite
 from ...robots import Robot
 from ...robots.loading import robot_digest
@@ -28,6 +26,7 @@ from ..consistency.variants import Variant, parse_variant, place
 from ..naming import free_folder
 from ..policies import Loaded, describe, load_policies
 from ..trials.scenario import Scenario, scenario_text
+from .folder import SearchLog, check_folder
 from .playing import Play, Players
 from .ranges import PARAMETERS, Case, Measures, Ranges, describe_case, measures_of, scenario_of
 from .request import OTHERS, WorstError, WorstRequest, WorstStatus
@@ -45,6 +44,7 @@ from .search import (
     upper_bound,
     waiting,
 )
+from .sentences import sentences
 
 SCHEMA = 1
 SEEDS = 6
@@ -162,7 +162,7 @@ def search_worst(
     prepared = request if isinstance(request, PreparedSearch) else prepare_search(request)
     torch.set_num_threads(1)  # several would change the last bits of the policy's output
     with ExitStack() as stack:
-        log = stack.enter_context(_Log(folder, _identity(prepared), resume=resume))
+        log = stack.enter_context(SearchLog(folder, _identity(prepared), resume=resume))
         policy, robot = prepared.loaded.policy, prepared.robot
         players = stack.enter_context(Players(policy, robot, cpu_threads(prepared.request.threads)))
         search = _Search(prepared, log, players, (1.0 - reserve) * 60.0 * prepared.request.minutes, watch)
@@ -197,73 +197,12 @@ def free_search_folder(folder: Path, prepared: PreparedSearch) -> Path:
 
     def is_free(candidate: Path) -> bool:
         try:
-            _check_folder(candidate, json.loads(json.dumps(_identity(prepared))), resume=True)
+            check_folder(candidate, json.loads(json.dumps(_identity(prepared))), resume=True)
         except WorstError:
             return False
         return True
 
     return free_folder(folder, is_free)
-
-
-def _check_folder(folder: Path, wanted: dict[str, Any], *, resume: bool) -> None:
-    """Raise ``WorstError`` where a search cannot use a folder."""
-    marker = folder / "search.json"
-    if folder.exists() and not folder.is_dir():
-        raise WorstError(f"{folder} is a file; give a folder with --out")
-    if marker.is_file():
-        present = parse_json(read_text(marker, "search", WorstError), str(marker), WorstError)
-        if present != wanted:
-            different = sorted(k for k in wanted if not isinstance(present, dict) or present.get(k) != wanted[k])
-            raise WorstError(
-                f"{folder} belongs to another search ({', '.join(different)} differ); give another folder with --out"
-            )
-        if not resume:
-            raise WorstError(
-                f"{folder} already holds this search; go on with --resume, or give another folder with --out"
-            )
-    elif folder.exists() and any(folder.iterdir()):
-        raise WorstError(f"{folder} is not empty and holds no search; give another folder with --out")
-
-
-class _Log:
-    """Finished batches on disk, by what was played: who plays the same again reads them."""
-
-    def __init__(self, folder: Path, identity: dict[str, Any], *, resume: bool) -> None:
-        marker, wanted = folder / "search.json", json.loads(json.dumps(identity))
-        self._folder = folder / "batches"
-        _check_folder(folder, wanted, resume=resume)
-        make_folder(self._folder, WorstError)
-        self._lock = lock_folder(folder, WorstError)
-        write_atomically(marker, json_text(wanted), WorstError)
-
-    def __enter__(self) -> _Log:
-        return self
-
-    def __exit__(self, *details: object) -> None:
-        self._lock.release()
-
-    def batch(self, key: object, play: Callable[[], list[Outcome]]) -> tuple[list[Outcome], float]:
-        """Return what came of a batch and the seconds that it took, from the disk where it was played before."""
-        name = hashlib.sha256(json.dumps(key, sort_keys=True).encode()).hexdigest()[:20]
-        path = self._folder / f"{name}.json"
-        if path.is_file():
-            data = parse_json(read_text(path, "batch", WorstError), str(path), WorstError)
-            return [Outcome(**row) for row in data["outcomes"]], float(data["seconds"])
-        began = time.perf_counter()
-        outcomes = play()
-        seconds = time.perf_counter() - began
-        data = {"seconds": round(seconds, 3), "outcomes": [asdict(outcome) for outcome in outcomes]}
-        with replacing(path, WorstError, durable=False) as partial:
-            partial.write_text(json_text(data))
-        return outcomes, seconds
-
-    def kept(self, name: str, value: int) -> int:
-        """Return a number that was decided once, deciding it now where it was not."""
-        path = self._folder / f"{name}.json"
-        if path.is_file():
-            return int(parse_json(read_text(path, name, WorstError), str(path), WorstError)[name])
-        write_atomically(path, json_text({name: value}), WorstError)
-        return value
 
 
 @dataclass(kw_only=True)
@@ -283,7 +222,7 @@ class _Found:
 class _Search:
     """One search at work."""
 
-    def __init__(self, prepared: PreparedSearch, log: _Log, players: Players, budget: float, watch: Watch) -> None:
+    def __init__(self, prepared: PreparedSearch, log: SearchLog, players: Players, budget: float, watch: Watch) -> None:
         self.prepared, self._log, self._players, self._watch = prepared, log, players, watch
         self._budget, self._seed, self._batch = budget, prepared.request.seed, prepared.request.batch
         self.archive, self._needed = Archive(prepared.ranges), Archive(prepared.ranges)
@@ -478,45 +417,3 @@ def _failure(prepared: PreparedSearch, elite: Elite, found: _Found) -> dict[str,
         "scenario": None,
         "film": None,
     }
-
-
-def sentences(results: dict[str, Any]) -> list[str]:
-    """Return the findings in sentences."""
-    label, sample, failures = results["policy"]["label"], results["sample"], results["failures"]
-    percent = f"{100 * results['rules']['confidence']:g} %"
-    found = [
-        f"{label} fell in {sample['falls']} of {sample['cases']} cases drawn uniformly from the ranges: the probability of a fall is "
-        f"at most {100 * sample['bound']:.1f} % ({percent} confidence, Clopper and Pearson; equal weights)."
-    ]
-    found += [
-        f"Of these falls, {count} are falls in {engine} too."
-        for engine, count in sample["again"].items()
-        if sample["falls"]
-    ]
-    plays = results["search"]["plays"]
-    if not failures and results["search"]["falls"]:
-        more = "go on with --resume and more --minutes"
-        return [
-            *found,
-            f"The budget ended before it was known what the falls need that were found in {plays} plays; {more}.",
-        ]
-    if not failures:
-        return [*found, f"The search found no failure in {plays} plays."]
-    if any(not failure["factors"] for failure in failures):
-        found.append("It falls where nothing is unusual.")
-    gallery = [failure for failure in failures if failure["rank"] is not None]
-    shown = "1 that is confirmed" if len(gallery) == 1 else f"{len(gallery)} that are confirmed and differ in cause"
-    found.append(f"The search found falls with {_sets(len(failures))}, among them {shown}.")
-    alone = [failure for failure in failures if failure["only_here"]]
-    if results["others"]:
-        engines = ", ".join(other["engine"] for other in results["others"])
-        found.append(
-            f"With the seeds that were played, {len(alone)} of {len(failures)} fall in {results['engine']} alone, not in {engines}."
-        )
-    else:
-        found.append("No other engine is installed here that could play them again.")
-    return found
-
-
-def _sets(count: int) -> str:
-    return "1 set of factors" if count == 1 else f"{count} sets of factors"

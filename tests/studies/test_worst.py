@@ -67,7 +67,7 @@ def searched(standing, monkeypatch):
             return [FALLEN if rule(scenario, variant.label) else UPRIGHT for scenario, _ in pairs]
 
         monkeypatch.setattr(study.Players, "play", play)
-        monkeypatch.setattr(study.time, "perf_counter", itertools.count().__next__)
+        monkeypatch.setattr("time.perf_counter", itertools.count().__next__)
         request = WorstRequest(policy=standing, minutes=minutes, others=others, threads=1, device="cpu", seed=seed)
         return study.search_worst(request, folder, resume=resume)
 
