@@ -3,15 +3,15 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from gaitgauge.gauge import evaluate as evaluation
 from gaitgauge.gauge.evaluate import Request
+from gaitgauge.gauge.play import progress
 from tiny_runs import evaluate, tiny_request
 
 
 @pytest.fixture
 def request_for(tmp_path, monkeypatch) -> Callable[..., Request]:
     """Makes requests for a tiny suite on an engine without physics; progress is told at every turn."""
-    monkeypatch.setattr(evaluation, "_WATCH_INTERVAL", 0.0)
+    monkeypatch.setattr(progress, "_WATCH_INTERVAL", 0.0)
     return lambda *base, **choices: tiny_request(tmp_path, *base, **choices)
 
 
