@@ -78,10 +78,14 @@ def write_contract(out: Path, robot: str, *, force: bool) -> None:
 
 
 def show_contract(request: ShowRequest) -> None:
-    """Print the contract that a policy is run with."""
-    from .policies import open_policy
+    """Print the contract that a policy is run with; its robot need not be installed."""
+    from ..policy.loading import load_policy
+    from ..robots import load_robot
+    from .policies import policy_file
 
-    policy, _ = open_policy(request.policy, request.robot, trust=request.trust, contract_file=request.contract)
+    asked = None if request.robot is None else load_robot(request.robot)
+    file = policy_file(request.policy)
+    policy = load_policy(file, asked, trust=request.trust, contract_file=request.contract)
     if request.json_output:
         print_json(policy.contract.to_dict())
     else:

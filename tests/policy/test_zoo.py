@@ -1,11 +1,14 @@
 """The zoo of public policies, and presets where a description is named: what goes before what, and what is refused."""
 
 import hashlib
+import json
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
+from gaitgauge.cli.inspect import show_contract
+from gaitgauge.cli.requests import ShowRequest
 from gaitgauge.policy import loading
 from gaitgauge.policy.base import PolicyError
 from gaitgauge.policy.contract import standard_contract
@@ -84,6 +87,13 @@ def test_a_known_file_needs_no_description(known):
     contract = load_policy(known).contract
     assert contract.hash == replace(HIMLOCO, command_limits=(0.5, 0.4, 0.3)).hash
     assert contract.provenance["licence"] == "MIT" and contract.provenance["assumed"] == "the rest"
+
+
+def test_contract_show_needs_no_robot(files, monkeypatch, capsys):
+    b2 = next(each for each in zoo().values() if each.robot == "b2")
+    monkeypatch.setattr(loading, "zoo", lambda: {hashlib.sha256(files[45].read_bytes()).hexdigest(): b2})
+    show_contract(ShowRequest(policy=str(files[45]), json_output=True))
+    assert json.loads(capsys.readouterr().out)["robot"] == "b2"
 
 
 def test_a_contract_that_is_given_or_lies_beside_it_goes_before_the_zoo(known, tmp_path):
