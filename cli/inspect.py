@@ -235,7 +235,7 @@ def _scenarios() -> Table:
 
 
 def _tasks() -> Table:
-    from ..training.tasks import TASKS
+    from ..training.tasks import GROUNDS, TASKS
 
     table = make_table(
         "tasks (gaitgauge train NAME)", "name", "title", "engine", "worlds", "iterations", "experiment folder"
@@ -245,6 +245,7 @@ def _tasks() -> Table:
         table.add_row(
             task.name, task.title, task.backend, str(task.environment.num_envs), str(run.iterations), run.experiment
         )
+    table.caption = f"by the body plan of --robot: {', '.join(GROUNDS)}"
     return table
 
 
