@@ -54,12 +54,12 @@ def _inspect(robot: Robot) -> None:
         getattr(checks, name)()
 
 
-def compiled(mjcf: Path) -> tuple[mujoco.MjSpec, mujoco.MjModel]:
-    """Compile a MuJoCo model's file without its visual meshes; raise ``RobotError`` where MuJoCo cannot."""
+def compiled(mjcf: Path, *, whole: bool = False) -> tuple[mujoco.MjSpec, mujoco.MjModel]:
+    """Compile a MuJoCo model's file, without its visual meshes unless ``whole``; raise ``RobotError`` where MuJoCo cannot."""
     import mujoco
 
     try:
-        spec = physical_spec(mjcf)
+        spec = mujoco.MjSpec.from_file(str(mjcf)) if whole else physical_spec(mjcf)
         return spec, spec.compile()
     except (ValueError, RuntimeError, TypeError, MemoryError, OSError, mujoco.FatalError) as error:
         if isinstance(error, RobotError):
@@ -102,7 +102,7 @@ class ModelChecks:
 
     def size(self) -> str:
         """Limit the number of parts: a few lines of XML can stand for a million, which every world would simulate."""
-        model = self.model
+        _, model = compiled(self.robot.mjcf, whole=True)  # engines and viewers compile visual meshes too
         counts = {"bodies": model.nbody, "geoms": model.ngeom, "sites": model.nsite, "degrees of freedom": model.nv}
         for kind, count in counts.items():
             if count > MOST_PARTS:

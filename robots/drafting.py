@@ -200,10 +200,10 @@ def _draft(path: Path, name: str | None, home: Path, answers: Answers) -> str:
     for key, (value, remark) in motors.items():
         table = joint_table(names, value) if isinstance(value, list) else value
         entries.append(Entry(f"parameters.gauge.{key}", table, remark))
-    text = ""
-    if survey.renamed or mends:
-        text, left_out = _model_text(path, survey, actuated, home)
-        mends += left_out
+    text, left_out = _model_text(path, survey, actuated, home)
+    mends += left_out
+    if not (survey.renamed or mends):
+        text = ""  # the file itself will do
     ends = ", ".join(survey.body_name(int(model.geom_bodyid[leg.feet[0]])) for leg in survey.legs)
     plan = f"{WORDS[survey.plan]}, with legs that end in {ends}"
     draft = Draft(name=entries[0].value, plan=plan, entries=tuple(entries), mends=tuple(mends), model=text)
@@ -220,11 +220,12 @@ def _model_text(path: Path, survey: Survey, actuated: mujoco.MjModel, home: Path
     survey.repeat(full)
     try:
         full.compile()
-    except (ValueError, RuntimeError, MemoryError, mujoco.FatalError):
+    except (ValueError, RuntimeError, MemoryError, mujoco.FatalError) as error:
+        reason = one_line(re.sub(r"'[^']*/", "'", str(error)).removeprefix("Error: "), 120)
+        if "unknown exception" in reason or "allocate memory" in reason:
+            reason = "they need more memory than a robot may take"
         full = survey.spec
-        left_out = [
-            f"{path.name}: visual meshes, with which MuJoCo needs more memory than a robot may take: left out of the copy"
-        ]
+        left_out = [f"{path.name}: visual meshes, which MuJoCo cannot compile ({reason}): left out of the copy"]
     for kind in ("meshdir", "texturedir"):
         setattr(full, kind, str(path.parent.resolve() / getattr(full, kind)))
     text = full.to_xml()

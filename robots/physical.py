@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING
-
-from ..files.parsing import one_line
-from .loading import RobotError
 
 if TYPE_CHECKING:
     import mujoco
 
 
 def physical_spec(mjcf: Path) -> mujoco.MjSpec:
-    """Return the model of a file without meshes that neither touch nor weigh anything; raise ``RobotError`` for a mesh that is lost."""
+    """Return the model of a file without meshes that neither touch nor weigh anything."""
     import mujoco
 
     spec = mujoco.MjSpec.from_file(str(mjcf))
@@ -25,14 +21,8 @@ def physical_spec(mjcf: Path) -> mujoco.MjSpec:
     used = {geom.meshname for geom in spec.geoms}
     skinned = bool(spec.skins)
     for mesh in list(spec.meshes):
-        if mesh.name in used or skinned:
-            continue
-        path = mjcf.parent / spec.meshdir / mesh.file
-        if mesh.file and not os.path.exists(path):
-            raise RobotError(
-                f"'{one_line(mjcf)}' names the mesh '{one_line(mesh.file)}', which is not at '{one_line(path)}'"
-            )
-        spec.delete(mesh)
+        if mesh.name not in used and not skinned:
+            spec.delete(mesh)
     return spec
 
 
