@@ -3,7 +3,7 @@
     python benchmarks/public_policies.py FOLDER [--robots MODELS] [--suite SUITE] [--threads N] [--out results/public] [--only TEXT]
 
 ``FOLDER`` has one folder for each policy, with the files that its authors ship beside it. ``MODELS`` has the makers' MuJoCo models of
-robots that do not ship with gaitgauge (``b2.xml``, ``g1_12dof.xml``, ``g1_29dof.xml``, ``h1.xml``); meshes are left out and
+robots that do not ship with gaitgauge (``b2.xml``, ``g1_12dof.xml``, ``h1.xml``); meshes are left out and
 missing trunks and soles become boxes. ``OUT/board.md`` has a table for each robot. ``--suite benchmarks/public_contracts/gentle.toml``
 asks for half of each policy's limits and pushes nothing.
 """
@@ -33,8 +33,6 @@ HERE = Path(__file__).parent / "public_contracts"
 KATARI = "katari16_configs/go2_isaaclab.yaml"
 CONTRACTS = {
     "katari16_policy_dc_cfg_comparasion": KATARI,
-    "playground_go1": HERE / "playground_go1.toml",
-    "playground_g1": HERE / "playground_g1.toml",
 }
 """Descriptions of policies that have none beside them, by the policy's folder; paths in ``FOLDER`` or of this benchmark."""
 
@@ -53,12 +51,10 @@ class Body:
 
 
 _LEGS = ("left_hip", "left_knee", "left_ankle", "right_hip", "right_knee", "right_ankle")
-_ARMS = {"shoulder_pitch_joint": 0.2, "elbow_joint": 0.6}
 _BENT = {"hip_pitch_joint": -0.1, "knee_joint": 0.3, "ankle_pitch_joint": -0.2}
 BODIES = {
     "b2": Body(model="b2", pose={"thigh_joint": 0.8, "calf_joint": -1.5}),
     "g1": Body(model="g1_12dof", pose=_BENT),
-    "g1_29": Body(model="g1_29dof", pose=_BENT | _ARMS),
     "h1": Body(
         model="h1",
         pose={"hip_pitch_joint": -0.1, "knee_joint": 0.3, "ankle_joint": -0.2},
@@ -70,9 +66,6 @@ ROBOTS = {
     "rl_sar_b2_robot_lab": "b2",
     "unitree_rl_gym_g1_motion": "g1",
     "unitree_rl_gym_h1_motion": "h1",
-    "unitree_rl_lab_g1_velocity_v0": "g1_29",
-    "unitree_rl_mjlab_g1_velocity_v0": "g1_29",
-    "playground_g1": "g1_29",
 }
 """Robots of policies by their folder; others are for one that ships."""
 
@@ -134,11 +127,6 @@ def build_robot(body: Body, models: Path, folder: Path) -> Path:
     compiled = mujoco.MjModel.from_xml_path(str(model))
     names = [compiled.joint(i).name for i in range(1, compiled.njnt)]
     pose = [next((v for end, v in body.pose.items() if n.endswith(end)), 0.0) for n in names]
-    if any("shoulder_roll" in n for n in names):
-        pose = [
-            (0.2 if n.startswith("left") else -0.2) if "shoulder_roll" in n else v
-            for n, v in zip(names, pose, strict=True)
-        ]
     keys = ElementTree.SubElement(root, "keyframe")
     ElementTree.SubElement(keys, "key", name="home", qpos=" ".join(map(str, [0, 0, 1.0, 1, 0, 0, 0, *pose])))
     tree.write(model)
