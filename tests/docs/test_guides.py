@@ -157,6 +157,7 @@ def test_links_lead_to_files(page):
 
 NIGHTLY = {
     "docs/guides/board.md": "tests/cli/test_verify_command.py",
+    "docs/guides/compare.md": "tests/cli/test_compare_command.py",
     "docs/guides/consistency.md": "tests/cli/test_consistency_command.py",
     "docs/start/first-training.md": "tests/cli/test_train.py",
 }
