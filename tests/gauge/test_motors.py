@@ -74,7 +74,7 @@ def test_a_base_linear_velocity_makes_a_score_privileged():
     assert notes(result) == ["privileged observations: no sensor of a robot measures base_linear_velocity_b"]
 
 
-@pytest.mark.parametrize("name", ["base_height", "foot_contact_force", "friction", "height_scan"])
+@pytest.mark.parametrize("name", ["base_height", "foot_contact_force", "friction"])
 def test_what_else_no_robot_measures_is_refused(name):
     with pytest.raises(ContractError, match="unknown observation term"):
         ObservationTerm(name=name, scale=(1.0,))
