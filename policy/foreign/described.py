@@ -149,6 +149,7 @@ default_joint_position = {pose}
 action_scale = {scale}
 # action_clip = 100.0                # of the network's output; last_action shows the clipped one
 # target_range = [-2.5, 2.5]         # lowest and highest joint target, or a pair per joint
+# velocity_joints = [...]            # wheels: their targets and action_scale are speeds [rad/s]
 # Gains of the motors: kp [N·m/rad], kd [N·m·s/rad].
 stiffness = {stiffness}
 damping = {damping}
@@ -169,6 +170,7 @@ history = {{ length = 1, order = "frame-major", start = "zeros" }}
 
 # The observation, term by term: scale times (value - reference), then clipped. Also known:
 # {{ name = "base_linear_velocity_b" }}; {{ name = "constant", values = [0.0] }};
+# {{ name = "height_scan", reference = 0.5, clip = 1.0, size = [1.6, 1.0], spacing = 0.1, fastest = "x" }};
 # {{ name = "gait_phase", period = 0.8, offsets = [0.0, 0.5], waves = ["sin", "cos"], at_rest = "runs" }} (or holds, zeros).
 observation = [
 {terms}
