@@ -198,7 +198,8 @@ class EnvironmentMemory:
         """Clear the tensors of one episode in the masked worlds, (N,) bool."""
         self.episode.masked_fill_(worlds[:, None], 0.0)
         self.episode_length.masked_fill_(worlds, 0)
-        self.clocks.masked_fill_(worlds[:, None], 0.0)
+        if self.clocks.shape[1]:
+            self.clocks.masked_fill_(worlds[:, None], 0.0)
         self.command_extreme.masked_fill_(worlds, False)
         self.just_reset.copy_(worlds)
 
