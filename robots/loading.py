@@ -66,7 +66,7 @@ def load_robot_file(path: str | Path) -> Robot:
     names = data.get("joint_names")
     if isinstance(names, list) and all(isinstance(n, str) for n in names) and len(set(names)) == len(names):
         _spread(data, ("default_joint_position", "action_scale"), names, source)
-        sets = data.get("parameters")
+        sets: Any = data.get("parameters")
         for name, table in sets.items() if isinstance(sets, dict) else ():
             if isinstance(table, dict):
                 _begin_like(table, sets, f"{source}: parameters.{name}")
