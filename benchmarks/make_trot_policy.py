@@ -14,7 +14,7 @@ from typing import Any
 from gaitgauge.policy.contract import standard_contract
 from gaitgauge.policy.native import StoredNetwork, save_policy
 from gaitgauge.robots import load_robot
-from gaitgauge.robots.body_plan import total_mass
+from gaitgauge.robots.anatomy.body_plan import total_mass
 
 # The Go2's legs, as its model file has them [m].
 GEOMETRY: dict[str, Any] = {

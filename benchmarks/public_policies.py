@@ -27,7 +27,7 @@ from gaitgauge.policy.contract import ContractError
 from gaitgauge.policy.loading import load_policy
 from gaitgauge.policy.native import FilePolicy
 from gaitgauge.robots import RobotError, load_robot
-from gaitgauge.robots.drafting import draft_robot
+from gaitgauge.robots.describing.drafting import draft_robot
 
 HERE = Path(__file__).parent / "public_contracts"
 KATARI = "katari16_configs/go2_isaaclab.yaml"

@@ -25,7 +25,7 @@ from gaitgauge.policy.base import Policy, PolicyError
 from gaitgauge.policy.loading import load_policy
 from gaitgauge.policy.robot_of import robot_for
 from gaitgauge.robots import Robot
-from gaitgauge.robots.body_plan import body_plan
+from gaitgauge.robots.anatomy.body_plan import body_plan
 from gaitgauge.studies.trials.running import Trial, run_scenario
 from gaitgauge.studies.trials.scenario import Scenario, load_scenario
 from pydantic import Field

@@ -19,7 +19,7 @@ from ..gauge.suite import Suite
 from ..policy.base import Policy
 from ..policy.foreign.adapters import AT_ONCE, doubt
 from ..robots import Robot
-from ..robots.body_plan import model_joint_order
+from ..robots.anatomy.body_plan import model_joint_order
 from ..robots.rotation import from_yaw, in_heading, tilt
 from ..studies.walking import Walk
 from ..terrains.base import Terrain

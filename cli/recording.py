@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from ..robots.body_plan import body_plan
+from ..robots.anatomy.body_plan import body_plan
 from .drawing import Shot, draw, processes_for
 from .overlay import annotate
 from .picture import Follower, Quality, Tile

@@ -13,11 +13,11 @@ from rich.text import Text
 
 from ..files.writing import make_folder, same_file, write_atomically
 from ..robots import Robot, RobotError, load_robot
-from ..robots.drafting import draft_robot
-from ..robots.examining import Finding, examine
-from ..robots.guessing import guessed_again
+from ..robots.checks.examining import Finding, examine
+from ..robots.describing.drafting import draft_robot
+from ..robots.describing.guessing import guessed_again
+from ..robots.describing.surveying import Answers
 from ..robots.loading import ROBOT_FILE, load_robot_file
-from ..robots.surveying import Answers
 from .console import Terminal, print_json, shell_command
 from .errors import UserError
 from .picture import Picture, Tile, choose_renderer
@@ -186,7 +186,7 @@ def _draw(robot: Robot, quality: Quality, path: Path) -> None:
     import imageio.v3
     import numpy as np
 
-    from ..robots.body_plan import body_plan, default_pose
+    from ..robots.anatomy.body_plan import body_plan, default_pose
     from ..terrains.registry import make_terrain
     from .scenery import visual_model
 

@@ -14,7 +14,7 @@ import torch
 from ..backends.base import PhysicsState
 from ..files.parsing import read_results
 from ..files.writing import json_text, write_atomically
-from ..robots.body_plan import body_plan
+from ..robots.anatomy.body_plan import body_plan
 from ..robots.rotation import rotate_inverse
 from ..studies.trials.running import run_each
 from ..studies.trials.scenario import Scenario, load_scenario

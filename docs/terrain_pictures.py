@@ -24,7 +24,7 @@ def drawn(title: str, terrain: Any, *, at: float = 0.0, down: float, far: float)
     quality = choose_renderer()  # before MuJoCo is imported
     from gaitgauge.cli.scenery import visual_model
     from gaitgauge.robots import load_robot
-    from gaitgauge.robots.body_plan import default_pose
+    from gaitgauge.robots.anatomy.body_plan import default_pose
 
     robot = load_robot("go2")
     quality = replace(quality, size=(720, 400), field_nodes=256, shadow_reach=9.0, shadow_pixels=2048)

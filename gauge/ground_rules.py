@@ -9,7 +9,7 @@ from typing import Annotated
 from pydantic import Field
 
 from ..robots import Robot
-from ..robots.body_plan import body_plan
+from ..robots.anatomy.body_plan import body_plan
 from ..terrains.base import Terrain
 from ..terrains.measured import measured_terrain
 from ..terrains.registry import make_terrain

@@ -12,8 +12,8 @@ import torch
 
 from ..backends.base import PhysicsState
 from ..files.parsing import shown
+from ..robots.anatomy.body_plan import LEG_PARTS, body_plan, joint_ranges, stance_span
 from ..robots.base import Robot
-from ..robots.body_plan import LEG_PARTS, body_plan, joint_ranges, stance_span
 from .metric_rules import GO2_LEG, GO2_MASS, Metrics, RobotScales
 from .support import Soles
 

@@ -8,9 +8,9 @@ from itertools import combinations
 import numpy as np
 import torch
 
+from ..robots.anatomy.body_plan import default_pose, sole_geoms
+from ..robots.anatomy.limbs import joint_chain
 from ..robots.base import Robot
-from ..robots.body_plan import default_pose, sole_geoms
-from ..robots.limbs import joint_chain
 from ..robots.rotation import rotate_inverse
 
 

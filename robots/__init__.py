@@ -1,7 +1,7 @@
 """Robots as data: the machine's MuJoCo model, joints, gains, limits and feet. Nothing here knows an engine."""
 
 from .base import JointParameters, Robot
-from .checking import check_robot
+from .checks.checking import check_robot
 from .loading import RobotError, load_robot_file
 from .registry import load_robot, robot_names
 

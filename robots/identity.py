@@ -21,7 +21,7 @@ from pydantic import Field
 
 from ..files.parsing import Name, Text, build, one_line
 from .base import Robot
-from .checking import check_robot
+from .checks.checking import check_robot
 from .loading import LARGEST_MODEL, RobotError, model_files, robot_digest
 from .registry import load_robot, robot_names
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from ..files.parsing import one_line, shown
 from ..files.plugins import guarded, load_plugin, origin, plugins
 from .base import Robot
-from .checking import check_robot
+from .checks.checking import check_robot
 from .loading import ROBOT_FILE, RobotError, checked_fields, did_you_mean, load_robot_file
 
 GROUP = "gaitgauge.robots"

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from .anatomy.body_plan import default_pose
 from .base import JointParameters, Robot
-from .body_plan import default_pose
 from .loading import PER_JOINT, RobotError
 
 

@@ -148,7 +148,8 @@ def figures_of_results_are_checked_once() -> Iterator[None]:
 @pytest.fixture(scope="module")
 def robots_are_tried_here() -> Iterator[None]:
     """Robots of a test's own need no process of their own to be compiled in: ``test_hostile_models.py`` needs it."""
-    from gaitgauge.robots import checking, drafting, examining
+    from gaitgauge.robots.checks import checking, examining
+    from gaitgauge.robots.describing import drafting
     from gaitgauge.robots.loading import model_files
 
     def run_here(work: Callable[[], str | None], mjcf: Path) -> str:

@@ -12,8 +12,8 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
+from ...robots.anatomy.body_plan import body_plan
 from ...robots.base import JointParameters, Robot
-from ...robots.body_plan import body_plan
 from ...terrains.base import Terrain
 from ..base import Capability, PhysicsBackend, PhysicsOptions, PhysicsState, Randomization, ResetState, Scene, Support
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...robots.body_plan import body_plan
+from ...robots.anatomy.body_plan import body_plan
 from ...terrains.base import Box, Terrain
 from ..base import TRAINING_PHYSICS, BackendError, PhysicsOptions
 from .bench import FLAT, WORLDS, Bench, Worlds, expect, expect_close

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...robots.body_plan import body_plan, joint_ranges
+from ...robots.anatomy.body_plan import body_plan, joint_ranges
 from .bench import Bench, Worlds, expect
 from .check import check
 from .reference import Reference

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ...robots.body_plan import body_plan
+from ...robots.anatomy.body_plan import body_plan
 from .bench import WORLDS, Bench, Worlds, expect, expect_close
 from .check import check
 from .kinematics import follow_reference, posed

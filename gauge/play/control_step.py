@@ -14,7 +14,7 @@ from ...policy.base import Policy
 from ...policy.batch_invariance import steady_session
 from ...policy.ground import Ground
 from ...policy.observation import ObservationBuilder
-from ...robots.body_plan import total_mass
+from ...robots.anatomy.body_plan import total_mass
 from ..episodes import Episode
 from ..goals import LATERAL_SPEED, Schedule
 from ..suite import Suite

@@ -9,7 +9,7 @@ from typing import Any
 
 from ...files.parsing import shown
 from ...robots import Robot, load_robot, robot_names
-from ...robots.body_plan import robot_model
+from ...robots.anatomy.body_plan import robot_model
 from ..base import PolicyError
 
 DEFAULT_ROBOT = "go2"

@@ -13,7 +13,7 @@ from pydantic import Field
 
 from ...files.parsing import Name, Text, did_you_mean, read_toml, shown
 from ...robots import Robot, RobotError
-from ...robots.body_plan import body_plan
+from ...robots.anatomy.body_plan import body_plan
 from ..base import PolicyError
 from ..contract import History, ObservationTerm, PolicyContract, reordered, standard_contract
 

@@ -22,7 +22,7 @@ from ...gauge.play.sampling import GRAVITY
 from ...gauge.results import health
 from ...gauge.store import RunFolder, StoreError, check_folder
 from ...policy.native import FilePolicy
-from ...robots.body_plan import total_mass
+from ...robots.anatomy.body_plan import total_mass
 from .attribution import FLOOR_DRAWS, Factor, effect_of_switch, rounded
 from .budget import Budget
 from .closed_loop import compare, floor_only, gap_only, play_variant

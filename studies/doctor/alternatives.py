@@ -15,7 +15,7 @@ from typing import get_args
 from ...policy.contract import ContractError, HistoryOrder, ObservationTerm, PolicyContract, reordered
 from ...policy.observation_table import observation
 from ...robots import Robot, RobotError
-from ...robots.body_plan import BodyPlan, body_plan
+from ...robots.anatomy.body_plan import BodyPlan, body_plan
 
 _ACTION_SCALES = (0.1, 0.2, 0.25, 0.3, 0.5, 1.0)
 """Action scales that are in use [rad]."""

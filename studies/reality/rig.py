@@ -19,7 +19,7 @@ import numpy as np
 from ...backends.base import PhysicsOptions, Scene
 from ...backends.registry import make_backend
 from ...robots import JointParameters, Robot
-from ...robots.body_plan import lowest_point
+from ...robots.anatomy.body_plan import lowest_point
 from ...terrains.registry import make_terrain
 from .log import Array, Log, LogError
 

@@ -25,7 +25,7 @@ from ...gauge.motors import joint_parameters
 from ...gauge.suite import load_suite
 from ...policy.base import Policy
 from ...robots import Robot
-from ...robots.body_plan import base_mass
+from ...robots.anatomy.body_plan import base_mass
 from ...robots.rotation import from_heading, from_yaw, rotate_inverse, tilt
 from ..walking import Walk
 from .scenario import Force, Ground, Scenario, ScenarioError

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 from ...robots import Robot
-from ...robots.body_plan import body_plan
+from ...robots.anatomy.body_plan import body_plan
 from ...terrains.course import Stretch
 from ..trials.scenario import Force, Ground, Leg, Patch, Payload, Scenario, Start, Success
 

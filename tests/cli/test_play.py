@@ -16,7 +16,7 @@ from gaitgauge.cli.play_session import beyond
 from gaitgauge.gauge.suite import load_suite
 from gaitgauge.policy.native import save_policy
 from gaitgauge.robots import load_robot
-from gaitgauge.robots.body_plan import model_joint_order
+from gaitgauge.robots.anatomy.body_plan import model_joint_order
 from gaitgauge.terrains.registry import make_terrain
 
 ROBOT = load_robot("go2")

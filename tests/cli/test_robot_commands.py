@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from gaitgauge.robots import load_robot
-from gaitgauge.robots.examining import examine
+from gaitgauge.robots.checks.examining import examine
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "robots"))
 

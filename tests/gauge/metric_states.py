@@ -5,7 +5,7 @@ from gaitgauge.gauge.instants import Instants
 from gaitgauge.gauge.metrics import MetricEvaluator
 from gaitgauge.gauge.play.sampling import GRAVITY
 from gaitgauge.gauge.suite import load_suite
-from gaitgauge.robots.body_plan import total_mass
+from gaitgauge.robots.anatomy.body_plan import total_mass
 from scipy.spatial.transform import Rotation
 from scripted_gauge import GO2
 

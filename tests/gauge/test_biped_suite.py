@@ -21,7 +21,7 @@ from gaitgauge.policy.contract import History, ObservationTerm, standard_contrac
 from gaitgauge.policy.native import StoredNetwork, save_policy
 from gaitgauge.policy.networks.architectures import MlpNetwork
 from gaitgauge.robots import load_robot
-from gaitgauge.robots.body_plan import body_plan
+from gaitgauge.robots.anatomy.body_plan import body_plan
 from tiny_runs import evaluate
 
 ROBOT, SUITE = two_soles(), load_suite("gaitgauge-biped-1")

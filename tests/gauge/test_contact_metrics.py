@@ -16,7 +16,7 @@ from gaitgauge.gauge.metrics import (
     zmp_margin,
 )
 from gaitgauge.robots import JointParameters, Robot
-from gaitgauge.robots.body_plan import stance_span
+from gaitgauge.robots.anatomy.body_plan import stance_span
 from gaitgauge.terrains.base import Box, Terrain
 from metric_states import OWN, SPAN, evaluate, evaluator, rows, scalar, turned
 from scripted_gauge import GO2

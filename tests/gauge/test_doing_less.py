@@ -15,7 +15,7 @@ from gaitgauge.gauge.play.feet import foot_torsion
 from gaitgauge.gauge.play.segments import Segment
 from gaitgauge.gauge.scoring import run_statistics
 from gaitgauge.robots import load_robot
-from gaitgauge.robots.body_plan import body_plan
+from gaitgauge.robots.anatomy.body_plan import body_plan
 from metric_states import OWN, REFERENCE, evaluator
 from scripted_gauge import GO2
 

@@ -17,7 +17,7 @@ from gaitgauge.gauge.metrics import (
     zmp_margin,
 )
 from gaitgauge.gauge.play.sampling import GRAVITY
-from gaitgauge.robots.body_plan import total_mass
+from gaitgauge.robots.anatomy.body_plan import total_mass
 from gaitgauge.robots.rotation import rotate_inverse
 from metric_states import OWN, REFERENCE, evaluate, rows, scalar, turned
 from scripted_gauge import GO2, fake, short_suite

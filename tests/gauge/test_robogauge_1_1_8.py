@@ -15,7 +15,7 @@ from gaitgauge.gauge.suite import load_suite
 from gaitgauge.policy.contract import standard_contract
 from gaitgauge.policy.loading import load_policy
 from gaitgauge.policy.observation_table import observation
-from gaitgauge.robots.body_plan import joint_ranges, stance_span
+from gaitgauge.robots.anatomy.body_plan import joint_ranges, stance_span
 from metric_states import evaluate, rows, turned
 from scripted_gauge import DIAGONAL, GO2, MAXIMUM, episode, scene, short_suite, to_the_end
 

@@ -5,9 +5,9 @@ from dataclasses import replace
 import mujoco
 import pytest
 from gaitgauge.robots import RobotError, load_robot
-from gaitgauge.robots.anatomy import anatomy, plan_of
-from gaitgauge.robots.body_plan import body_plan
-from gaitgauge.robots.limbs import joint_chain, joint_roles, moving_tips
+from gaitgauge.robots.anatomy.body_plan import body_plan
+from gaitgauge.robots.anatomy.limbs import joint_chain, joint_roles, moving_tips
+from gaitgauge.robots.anatomy.roles import anatomy, plan_of
 from stick_biped import write_biped
 
 GO2 = load_robot("go2")

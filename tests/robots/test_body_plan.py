@@ -10,7 +10,7 @@ from gaitgauge.backends.mujoco.model import build_models
 from gaitgauge.gauge.metrics import MetricEvaluator
 from gaitgauge.gauge.suite import load_suite
 from gaitgauge.robots import RobotError, check_robot, load_robot
-from gaitgauge.robots.body_plan import body_plan, mirror_image
+from gaitgauge.robots.anatomy.body_plan import body_plan, mirror_image
 from gaitgauge.robots.loading import robot_digest
 from gaitgauge.terrains.registry import make_terrain
 from unseen_robot import LEGS, LOWER, MASS, UPPER

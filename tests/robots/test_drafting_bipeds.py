@@ -5,12 +5,12 @@ import re
 import numpy as np
 import pytest
 from gaitgauge.robots import RobotError, load_robot
-from gaitgauge.robots.anatomy import anatomy
-from gaitgauge.robots.body_plan import body_plan, default_pose
-from gaitgauge.robots.drafting import draft_robot, joint_table
-from gaitgauge.robots.examining import examine
-from gaitgauge.robots.guessing import guessed_again
-from gaitgauge.robots.surveying import Answers
+from gaitgauge.robots.anatomy.body_plan import body_plan, default_pose
+from gaitgauge.robots.anatomy.roles import anatomy
+from gaitgauge.robots.checks.examining import examine
+from gaitgauge.robots.describing.drafting import draft_robot, joint_table
+from gaitgauge.robots.describing.guessing import guessed_again
+from gaitgauge.robots.describing.surveying import Answers
 from stick_biped import ARMS_MASS, MASS, write_biped
 from stick_robot import PLATE, SHANKS, write_stick
 

@@ -6,9 +6,9 @@ import mujoco
 import numpy as np
 import pytest
 from gaitgauge.robots import Robot
-from gaitgauge.robots.body_plan import body_plan, default_pose
-from gaitgauge.robots.drafting import Draft, draft_robot
-from gaitgauge.robots.examining import examine
+from gaitgauge.robots.anatomy.body_plan import body_plan, default_pose
+from gaitgauge.robots.checks.examining import examine
+from gaitgauge.robots.describing.drafting import Draft, draft_robot
 from gaitgauge.robots.loading import load_robot_file
 from stick_robot import LINK, MASS, PLATE, RADIUS, SHANKS, write_stick
 from unseen_robot import write_unseen

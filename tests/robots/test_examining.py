@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 from gaitgauge.robots import Robot, load_robot, robot_names
-from gaitgauge.robots.examining import examine
+from gaitgauge.robots.checks.examining import examine
 from gaitgauge.robots.loading import robot_digest
 
 GO2 = load_robot("go2")

@@ -10,8 +10,8 @@ from gaitgauge.backends.base import ResetState
 from gaitgauge.policy.contract import ContractError, check_robot, standard_contract
 from gaitgauge.policy.observation import ObservationBuilder
 from gaitgauge.robots import RobotError, load_robot
-from gaitgauge.robots.body_plan import body_plan, mirror_image
-from gaitgauge.robots.examining import examine
+from gaitgauge.robots.anatomy.body_plan import body_plan, mirror_image
+from gaitgauge.robots.checks.examining import examine
 from gaitgauge.robots.loading import checked_fields
 from gaitgauge.terrains.base import Terrain
 

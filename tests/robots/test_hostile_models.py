@@ -9,7 +9,8 @@ from pathlib import Path
 
 import mujoco
 import pytest
-from gaitgauge.robots import RobotError, apart, checking, load_robot, loading
+from gaitgauge.robots import RobotError, load_robot, loading
+from gaitgauge.robots.checks import apart, checking
 from gaitgauge.robots.loading import model_files
 
 GO2 = load_robot("go2").mjcf.parent

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from gaitgauge.backends.conformance import Outcome, run_conformance
 from gaitgauge.robots import load_robot, robot_names
-from gaitgauge.robots.body_plan import body_plan, default_pose, mirror_image
-from gaitgauge.robots.examining import damped_share, examine
+from gaitgauge.robots.anatomy.body_plan import body_plan, default_pose, mirror_image
+from gaitgauge.robots.checks.examining import damped_share, examine
 from gaitgauge.training.environment.environment import TrainingEnvironment
 from gaitgauge.training.tasks import find_task
 

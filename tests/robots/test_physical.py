@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 from gaitgauge.robots import RobotError
-from gaitgauge.robots.checking import compiled
+from gaitgauge.robots.checks.checking import compiled
 from gaitgauge.robots.physical import physical_spec
 
 MODEL = """<mujoco><asset><mesh name="look" {mesh}/><mesh name="hull" vertex="0 0 0 1 0 0 0 1 0 0 0 1"/></asset><worldbody>

@@ -5,7 +5,8 @@ import sys
 from dataclasses import replace
 
 import pytest
-from gaitgauge.robots import JointParameters, RobotError, check_robot, checking, load_robot, robot_names
+from gaitgauge.robots import JointParameters, RobotError, check_robot, load_robot, robot_names
+from gaitgauge.robots.checks import checking
 from gaitgauge.robots.loading import robot_digest
 
 pytestmark = pytest.mark.usefixtures("robots_are_tried_here")

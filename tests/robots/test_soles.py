@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from gaitgauge.backends.conformance.soles import HEIGHT, two_soles
 from gaitgauge.robots import RobotError, check_robot
-from gaitgauge.robots.body_plan import body_plan
+from gaitgauge.robots.anatomy.body_plan import body_plan
 from gaitgauge.robots.loading import _check, robot_digest
 
 SPHERES, BOX = two_soles().foot_shapes

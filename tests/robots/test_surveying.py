@@ -2,8 +2,8 @@
 
 import mujoco
 import pytest
-from gaitgauge.robots.motor_guess import guess_motors
-from gaitgauge.robots.surveying import Survey
+from gaitgauge.robots.describing.motor_guess import guess_motors
+from gaitgauge.robots.describing.surveying import Survey
 from unseen_robot import LEGS, write_unseen
 
 

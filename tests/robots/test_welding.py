@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from gaitgauge.robots import RobotError, load_robot
-from gaitgauge.robots.body_plan import default_pose, total_mass
+from gaitgauge.robots.anatomy.body_plan import default_pose, total_mass
 from gaitgauge.robots.welding import welded
 
 G1 = load_robot("g1")

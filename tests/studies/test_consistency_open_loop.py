@@ -10,7 +10,7 @@ from gaitgauge.backends.base import DESCRIPTION_KEYS, Randomization
 from gaitgauge.gauge.suite import load_suite
 from gaitgauge.policy.contract import standard_contract
 from gaitgauge.robots import load_robot
-from gaitgauge.robots.body_plan import total_mass
+from gaitgauge.robots.anatomy.body_plan import total_mass
 from gaitgauge.studies.consistency.models import compare_models, entry_names
 from gaitgauge.studies.consistency.open_loop import (
     DURATION,

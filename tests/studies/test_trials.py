@@ -11,7 +11,7 @@ import torch
 from gaitgauge.gauge.chance.intervals import wilson_interval
 from gaitgauge.gauge.suite import SuiteError
 from gaitgauge.policy.loading import load_policy
-from gaitgauge.robots.body_plan import base_mass
+from gaitgauge.robots.anatomy.body_plan import base_mass
 from gaitgauge.studies.trials import running
 from gaitgauge.studies.trials.running import Trial, draws, run_each, run_scenario
 from gaitgauge.studies.trials.scenario import (

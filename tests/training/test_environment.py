@@ -5,7 +5,7 @@ from dataclasses import fields, replace
 
 import pytest
 import torch
-from gaitgauge.robots.body_plan import joint_ranges
+from gaitgauge.robots.anatomy.body_plan import joint_ranges
 from gaitgauge.robots.registry import load_robot
 from gaitgauge.training.configuration import ConfigurationError
 from gaitgauge.training.environment.configuration import (

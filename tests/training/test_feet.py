@@ -8,7 +8,7 @@ import pytest
 import torch
 from gaitgauge.policy.export.files import ExportError, deploy_settings
 from gaitgauge.robots import load_robot
-from gaitgauge.robots.body_plan import default_pose
+from gaitgauge.robots.anatomy.body_plan import default_pose
 from gaitgauge.training.configuration import ConfigurationError
 from gaitgauge.training.environment.configuration import GaitConfiguration
 from gaitgauge.training.environment.environment import TrainingEnvironment

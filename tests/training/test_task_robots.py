@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from gaitgauge.gauge.suite import load_suite
 from gaitgauge.robots import RobotError, load_robot
-from gaitgauge.robots.body_plan import body_plan, default_pose
+from gaitgauge.robots.anatomy.body_plan import body_plan, default_pose
 from gaitgauge.training.tasks import TaskError, find_task
 from gaitgauge.training.tasks.scaling import ratios, scaled
 

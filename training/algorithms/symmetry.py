@@ -2,7 +2,7 @@
 
 Mirroring at the robot's sagittal plane (y to -y) keeps the x and z entries of a vector and flips its y entry; of an
 axial vector such as an angular velocity it flips x and z and keeps y. Left legs change places with right legs; which
-joint is whose image, and which change sign, is read off the robot's model (``robots.body_plan``).
+joint is whose image, and which change sign, is read off the robot's model (``robots.anatomy.body_plan``).
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ import torch
 from ...policy.contract import ObservationTerm, PolicyContract
 from ...policy.ground import scan_points
 from ...policy.observation_table import HEIGHT_SCAN, observation
+from ...robots.anatomy.body_plan import mirror_image
 from ...robots.base import Robot
-from ...robots.body_plan import mirror_image
 from ...terrains.height_scan import scan_pattern
 from ..environment.configuration import ObservationConfiguration
 

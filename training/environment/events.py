@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import torch
 
 from ...backends.base import PhysicsOptions, PhysicsState, ResetState
+from ...robots.anatomy.body_plan import joint_ranges
 from ...robots.base import Robot
-from ...robots.body_plan import joint_ranges
 from ...robots.rotation import from_yaw
 from ...terrains.height_scan import HeightRasters, place_pattern, scan_pattern
 from .configuration import PushConfiguration, RandomizationConfiguration, ResetConfiguration

@@ -8,10 +8,10 @@ import torch
 
 from ...backends.base import PhysicsState
 from ...policy.contract import RESTING
-from ...robots.anatomy import anatomy
+from ...robots.anatomy.body_plan import body_plan, default_pose, sole_geoms
+from ...robots.anatomy.limbs import joint_chain
+from ...robots.anatomy.roles import anatomy
 from ...robots.base import Robot
-from ...robots.body_plan import body_plan, default_pose, sole_geoms
-from ...robots.limbs import joint_chain
 from ...robots.rotation import projected_gravity
 from ..configuration import ConfigurationError
 from .configuration import GaitConfiguration

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import torch
 
 from ...policy.contract import RESTING
-from ...robots.anatomy import anatomy
+from ...robots.anatomy.roles import anatomy
 from ...robots.base import Robot
 from ...robots.rotation import projected_gravity
 from .reward_configuration import PoseWeights

@@ -10,7 +10,7 @@ from ...files.parsing import shown
 from ...policy.contract import History, ObservationTerm, PolicyContract, standard_contract
 from ...policy.observation_table import HEIGHT_SCAN
 from ...policy.robot_of import REMEMBERED
-from ...robots.anatomy import anatomy
+from ...robots.anatomy.roles import anatomy
 from ...robots.base import JointParameters, Robot
 from ...robots.identity import identify
 from ...robots.loading import RobotError

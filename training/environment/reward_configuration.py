@@ -43,7 +43,7 @@ class OwnReward(OwnTerm):
 
 @dataclass(frozen=True, kw_only=True)
 class PoseWeights:
-    """Weight of each joint in ``pose`` by its role, which ``robots.anatomy`` tells from the model."""
+    """Weight of each joint in ``pose`` by its role, which ``robots.anatomy.roles`` tells from the model."""
 
     hip_roll: float = 1.0
     """Legs to the side."""

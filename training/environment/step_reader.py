@@ -8,8 +8,8 @@ from collections.abc import Sequence
 import torch
 
 from ...backends.base import PhysicsState
+from ...robots.anatomy.body_plan import body_plan, joint_ranges, mirror_image
 from ...robots.base import JointParameters, Robot
-from ...robots.body_plan import body_plan, joint_ranges, mirror_image
 from ...robots.rotation import rotate_inverse
 from ...terrains.height_scan import HeightRasters, heading_and_upright, place_pattern
 from ..configuration import ConfigurationError

@@ -11,7 +11,7 @@ from ...backends.base import TRAINING_PHYSICS
 from ...files.parsing import one_line, shown
 from ...files.plugins import imported
 from ...robots import load_robot
-from ...robots.anatomy import PLANS, WORDS, Plan, anatomy
+from ...robots.anatomy.roles import PLANS, WORDS, Plan, anatomy
 from ...robots.loading import robot_digest
 from ..configuration import AlgorithmConfiguration, NetworkConfiguration, Ramp, RunConfiguration, TrainingConfiguration
 from ..environment.configuration import (

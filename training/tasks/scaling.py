@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 from ...policy.contract import standard_contract
 from ...robots import Robot, load_robot
-from ...robots.body_plan import body_plan
+from ...robots.anatomy.body_plan import body_plan
 from ..configuration import Ramp, Range, TrainingConfiguration
 from ..environment.configuration import CommandStage, EnvironmentConfiguration
 from ..environment.reward_configuration import FOOT_TERMS

@@ -8,9 +8,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from ..files.parsing import one_line, parse_toml, read_text
+from ...files.parsing import one_line, parse_toml, read_text
+from ..loading import ROBOT_FILE, RobotError, load_robot_file
 from .drafting import Draft, Entry, draft_robot, tag_of
-from .loading import ROBOT_FILE, RobotError, load_robot_file
 from .surveying import Answers
 
 _TAGGED = re.compile(r"# (.*) \[([0-9a-f]{4})\]$")

@@ -7,11 +7,11 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..files.parsing import did_you_mean, one_line
+from ...files.parsing import did_you_mean, one_line
+from ..base import Robot
+from ..loading import MOST_PARTS, RobotError, robot_digest
+from ..physical import physical_spec
 from .apart import run_apart
-from .base import Robot
-from .loading import MOST_PARTS, RobotError, robot_digest
-from .physical import physical_spec
 
 if TYPE_CHECKING:
     import mujoco

@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..files.parsing import one_line
+from ...files.parsing import one_line
 
 if TYPE_CHECKING:
     import mujoco

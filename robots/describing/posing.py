@@ -8,9 +8,9 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from ..files.parsing import did_you_mean, one_line
-from .loading import RobotError, fits
-from .standing import FOLDED
+from ...files.parsing import did_you_mean, one_line
+from ..checks.standing import FOLDED
+from ..loading import RobotError, fits
 from .surveying import Leg, Survey
 
 _BEND = {True: 0.95, False: 0.8}

@@ -8,9 +8,9 @@ from collections.abc import Callable
 from multiprocessing.connection import Connection
 from pathlib import Path
 
-from ..files.cell import CONTEXT, MEMORY, allow_seconds, enclose
-from ..files.parsing import one_line
-from .loading import RobotError, model_files
+from ...files.cell import CONTEXT, MEMORY, allow_seconds, enclose
+from ...files.parsing import one_line
+from ..loading import RobotError, model_files
 
 COMPUTING_SECONDS = 10
 """Most CPU time for compiling and checking a robot [s]."""

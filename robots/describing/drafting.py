@@ -15,16 +15,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..files.parsing import build, one_line, parse_json
-from .anatomy import WORDS
-from .apart import run_apart
-from .base import JointParameters
-from .checking import compiled
-from .loading import RobotError, fits
+from ...files.parsing import build, one_line, parse_json
+from ..anatomy.roles import WORDS
+from ..base import JointParameters
+from ..checks.apart import run_apart
+from ..checks.checking import compiled
+from ..checks.standing import MOST_SAG, stand_still
+from ..loading import RobotError, fits
 from .mending import mend
 from .motor_guess import Remarked, guess_motors
 from .posing import standing_pose
-from .standing import MOST_SAG, stand_still
 from .surveying import GRAVITY, Answers, Survey
 
 if TYPE_CHECKING:

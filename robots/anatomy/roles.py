@@ -9,10 +9,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from .base import Robot
+from ..base import Robot
+from ..loading import RobotError
 from .body_plan import body_plan, default_pose, foot_centers
 from .limbs import joint_chain, joint_roles
-from .loading import RobotError
 
 Plan = Literal["quadruped", "biped", "humanoid", "wheeled", "hexapod"]
 PLANS: Mapping[int, Plan] = {2: "biped", 4: "quadruped", 6: "hexapod"}

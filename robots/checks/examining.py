@@ -10,11 +10,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..files.parsing import build, parse_json
-from .anatomy import WORDS, anatomy
-from .apart import run_apart
-from .base import JointParameters, Robot
-from .body_plan import (
+from ...files.parsing import build, parse_json
+from ..anatomy.body_plan import (
     body_plan,
     default_pose,
     foot_centers,
@@ -23,10 +20,13 @@ from .body_plan import (
     mirror_image,
     sole_geoms,
 )
+from ..anatomy.feet import shank_end
+from ..anatomy.limbs import joint_chain
+from ..anatomy.roles import WORDS, anatomy
+from ..base import JointParameters, Robot
+from ..loading import RobotError
+from .apart import run_apart
 from .checking import DEPTH_TOLERANCE, ModelChecks
-from .feet import shank_end
-from .limbs import joint_chain
-from .loading import RobotError
 from .standing import balance, folded, sag, stand
 
 if TYPE_CHECKING:

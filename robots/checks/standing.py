@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .anatomy import anatomy
-from .base import JointParameters, Robot
-from .body_plan import body_plan, default_pose, lowest_point, sole_geoms
-from .loading import RobotError
-from .physical import physical_spec
+from ..anatomy.body_plan import body_plan, default_pose, lowest_point, sole_geoms
+from ..anatomy.roles import anatomy
+from ..base import JointParameters, Robot
+from ..loading import RobotError
+from ..physical import physical_spec
 
 if TYPE_CHECKING:
     import mujoco

@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from ..files.parsing import did_you_mean, one_line
-from .anatomy import plan_of
-from .body_plan import lowest_point, stretched_length
-from .checking import solid
-from .feet import add_foot, copy_geom, shank_end
-from .limbs import is_wheel, joint_chain, joint_roles, moving_tips, pitch_joints
-from .loading import RobotError
-from .physical import is_visual_mesh
+from ...files.parsing import did_you_mean, one_line
+from ..anatomy.body_plan import lowest_point, stretched_length
+from ..anatomy.feet import add_foot, copy_geom, shank_end
+from ..anatomy.limbs import is_wheel, joint_chain, joint_roles, moving_tips, pitch_joints
+from ..anatomy.roles import plan_of
+from ..checks.checking import solid
+from ..loading import RobotError
+from ..physical import is_visual_mesh
 
 if TYPE_CHECKING:
     import mujoco

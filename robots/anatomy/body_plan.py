@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from .base import Robot
+from ..base import Robot
+from ..loading import RobotError
+from ..physical import physical_spec
 from .limbs import joint_chain, pitch_joints
-from .loading import RobotError
-from .physical import physical_spec
 
 if TYPE_CHECKING:
     import mujoco

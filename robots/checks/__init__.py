@@ -1,0 +1,1 @@
+"""Compare a description with its model, and let the robot stand."""
