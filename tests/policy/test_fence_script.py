@@ -181,7 +181,7 @@ def test_an_archive_with_a_call_in_its_data_is_refused(tmp_path):
 
 
 class SlowWithMemory(nn.Module):
-    """A few bytes of numbers that one operator multiplies to 268 MB on its way."""
+    """A few bytes of numbers that one operator multiplies to 268 MB on its way, three times, slow on any machine."""
 
     def __init__(self):
         super().__init__()
@@ -189,7 +189,10 @@ class SlowWithMemory(nn.Module):
 
     def forward(self, observation: torch.Tensor) -> torch.Tensor:
         wide = observation[:, :1].expand(-1, 8192)
-        return self.layer(observation) + torch.einsum("ai,aj,i,j->", wide, wide, wide[0], wide[0]) * 0.0
+        product = torch.zeros(())
+        for _ in range(3):
+            product = product + torch.einsum("ai,aj,i,j->", wide, wide, wide[0], wide[0])
+        return self.layer(observation) + product * 0.0
 
 
 class Packed(nn.Module):
