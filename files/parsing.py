@@ -141,11 +141,7 @@ def parse_json(text: str | bytes, source: str, error: type[Exception], *, most: 
 
 
 def read_results(path: Path, what: str, error: type[Exception]) -> dict[str, Any]:
-    """Read the table of a JSON file that this package wrote and that may be large or edited since.
-
-    Raises:
-        error: no such file, too large, not readable, no valid JSON, or no table.
-    """
+    """Read the table of a JSON file that this package wrote; raise ``error`` where it is too large, not readable or no table."""
     text = read_text(path, what, error, largest=LARGEST_RESULTS)
     found = parse_json(text, f"{what} '{one_line(path)}'", error, most=LARGEST_RESULTS // 10)
     if not isinstance(found, dict):
@@ -301,17 +297,9 @@ def build(
 
 
 def read_toml(path: Path, kind: type[Kind], what: str, error: type[Exception], *, source: str = "") -> Kind:
-    """Read a TOML file into a frozen dataclass.
-
-    Args:
-        what: of the file in the sentence (``suite file``), as for ``read_text``.
-        source: name in sentences on its content; the file's own by default.
-
-    Raises:
-        error: as ``read_text``, ``parse_toml`` and ``build``.
-    """
-    source = source or path.name
-    return build(kind, parse_toml(read_text(path, what, error), source, error), source, error)
+    """Read a TOML file into a dataclass: ``what`` as for ``read_text``, ``source`` as for ``build``, by default its name."""
+    data = parse_toml(read_text(path, what, error), source or path.name, error)
+    return build(kind, data, source or path.name, error)
 
 
 def take(kind: type[Kind], data: object, source: str, error: type[Exception]) -> Kind:

@@ -14,6 +14,8 @@ from gaitgauge.robots.describing.surveying import Answers
 from stick_biped import ARMS_MASS, MASS, write_biped
 from stick_robot import PLATE, SHANKS, write_stick
 
+pytestmark = pytest.mark.usefixtures("robots_are_tried_here")
+
 PASSIVE = '<default><joint damping="0.3" armature="0.01"/></default>'
 FLOOR = (
     '<worldbody><geom name="floor" type="plane" size="1 1 1"/><body name="table" pos="2 0 0"><geom size="0.1"/></body>'

@@ -8,6 +8,8 @@ from gaitgauge.robots import Robot, load_robot, robot_names
 from gaitgauge.robots.checks.examining import examine
 from gaitgauge.robots.loading import robot_digest
 
+pytestmark = pytest.mark.usefixtures("robots_are_tried_here")
+
 GO2 = load_robot("go2")
 
 
