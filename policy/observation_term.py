@@ -1,4 +1,4 @@
-"""What a policy's input is made of: terms of an observation, past frames, parts of a layout, a second network."""
+"""Describe a policy's input: terms of an observation, past frames, parts of a layout, a second network."""
 
 from __future__ import annotations
 

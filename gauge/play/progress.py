@@ -59,7 +59,7 @@ class Status:
 
 
 class Playing(Protocol):
-    """What the meter reads: ``Dispatcher`` has it."""
+    """Counters that the meter reads; ``Dispatcher`` has them."""
 
     plans: list[Plan]
 
@@ -101,7 +101,7 @@ class Length(NamedTuple):
 
 
 class Lengths:
-    """What episodes usually take: from the suite at first, then from those that have ended on the same terrain, and on others."""
+    """Usual lengths of episodes: from the suite at first, then from episodes that have ended on the same terrain and on others."""
 
     def __init__(self, suite: Suite) -> None:
         self._suite, self._known = suite, dict[tuple[str, ...], Length]()

@@ -138,7 +138,7 @@ class Stages:
 
     stages: Sequence[Stage]
     in_seconds: bool = True
-    """Whether costs are times; else nothing is estimated before something is done."""
+    """True if costs are times [s]; otherwise nothing is estimated before the first work is done."""
     _taken: dict[str, float] = field(default_factory=dict)
     _planned: dict[str, float] = field(default_factory=dict)
     _now: int = -1

@@ -63,7 +63,7 @@ class Draft:
     """The body plan and its legs, in words."""
     entries: tuple[Entry, ...]
     mends: tuple[str, ...]
-    """What was taken out of the model's copy, a sentence with the line for each."""
+    """Mends of the model's copy, a sentence with the line for each."""
     model: str
     """The model as MJCF, mended, with added names and feet that the description needs; empty where the file itself will do."""
 

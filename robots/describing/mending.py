@@ -20,7 +20,7 @@ def mend(path: Path, spec: mujoco.MjSpec, model: mujoco.MjModel) -> list[str]:
     """Mend the spec of a model, which holds one free joint at most; return a sentence with the line for each mend.
 
     Args:
-        path: the model's file, whose lines the sentences name.
+        path: the model's file; the sentences name its lines.
         model: compiled from ``spec``.
     """
     import mujoco

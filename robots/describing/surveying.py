@@ -31,7 +31,7 @@ _SOLE = 0.02
 
 @dataclass(frozen=True, kw_only=True)
 class Answers:
-    """What a user says of a robot where the model does not; empty where nothing is said."""
+    """Answers of a user to what the model does not tell; empty where none was given."""
 
     legs: tuple[str, ...] = ()
     """A body, a joint or a shape of each leg."""

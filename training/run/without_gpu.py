@@ -9,7 +9,7 @@ from ...files.choices import cpu_threads
 from ..tasks import TASKS, Task, find_task
 from .request import TrainRequest
 
-_TOY, _TOY_TIMES = TASKS["toy"], (132e-6, 81e-6)
+_TOY, _TOY_TIMES = TASKS["toy"], (113e-6, 68e-6)
 """CPU time of a step of ``toy`` on one core, and of the physics, which all cores share [s] (``benchmarks/toy_training.py``)."""
 _TIMES = (0.0, 1380e-6)
 """The same of ``go2-flat``, which made 1,450 steps a second on two cores; torch, too, uses all cores there."""
