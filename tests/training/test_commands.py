@@ -6,6 +6,7 @@ import pytest
 import torch
 from gaitgauge.training.environment.commands import COMMAND_COLUMNS, CommandGenerator, largest_commands
 from gaitgauge.training.environment.configuration import CommandConfiguration, CommandStage, Ramp
+from gaitgauge.training.environment.terrain_configuration import TileConfiguration
 
 COUNT = 40_000
 torch.set_num_threads(1)  # small tensors: threads only get in each other's way
@@ -23,11 +24,16 @@ PLAIN = CommandConfiguration(
 )
 
 
-def draw(configuration, *, progress=0.0, kind=0, count=COUNT, **changes):
+TILES = tuple(
+    TileConfiguration(name=name, share=1.0, command_limits=limits, sigma=0.25, ends=ends)
+    for name, limits, ends in zip(("stairs_up", "flat"), LIMITS, (True, False), strict=True)
+)
+
+
+def draw(configuration, *, progress=0.0, kind=0, count=COUNT, tiles=TILES, **changes):
     generator = CommandGenerator(
         configuration,
-        terrain_limits=LIMITS,
-        terrain_ends=(True, False),
+        tiles=tiles,
         control_period=0.02,
         max_episode_length=1250,
         device="cpu",
@@ -187,3 +193,32 @@ def test_crossings_keep_to_a_range_that_goes_one_way():
         stage = replace(STAGES[1], begin=0.0, forward=bounds)
         forward = draw(replace(PLAIN, stages=(stage,), crossing_probability=1.0)).command[:, 0]
         assert forward.aminmax() == pytest.approx(expected, abs=1e-3)
+
+
+def test_commands_of_a_tile_are_reversed_and_short_where_it_says_so():
+    kinds = (replace(TILES[0], reversal_probability=0.4, interval=3.0), TILES[1])
+    begun, before = torch.ones(COUNT, dtype=torch.int64), torch.tensor([0.5, -0.2, 0.6]).expand(COUNT, 3)
+    drawn = draw(PLAIN, tiles=kinds, episode_length=begun, command=before)
+    back = (drawn.command[:, :2] == -before[:, :2]).all(dim=1)
+    assert share(back) == pytest.approx(0.4, abs=0.01) and drawn.steps.unique().tolist() == [150]
+    assert share(drawn.holds_heading[back]) == pytest.approx(0.5, abs=0.02)
+    assert drawn.command[back & drawn.holds_heading][:, 2].unique().tolist() == [0.0]
+    assert drawn.command[back & ~drawn.holds_heading][:, 2].unique().tolist() == pytest.approx([-0.6])
+    turning = draw(PLAIN, tiles=kinds, episode_length=begun, command=before * torch.tensor([0.0, 0.0, 1.0]))
+    turned = (turning.command == torch.tensor([0.0, 0.0, -0.6])).all(dim=1)
+    assert share(turned) == pytest.approx(0.4, abs=0.01), "a turn on the spot is always reversed, never halted"
+    for same in (
+        draw(PLAIN, tiles=kinds, command=before),
+        draw(PLAIN, tiles=kinds, kind=1, episode_length=begun, command=before),
+    ):
+        assert not (same.command[:, :2] == -before[:, :2]).all(dim=1).any(), "a first command, or another tile"
+
+
+def test_a_tile_has_its_own_share_of_halts_and_of_turns_on_the_spot():
+    kinds = (replace(TILES[0], stationary_probability=2.0, stationary_yaw_probability=3.0), TILES[1])
+    still = replace(PLAIN, stationary_probability=Ramp(start=0.2, end=0.2))
+    for kind, halts, turns in ((0, 0.4, 0.75), (1, 0.2, 0.25)):
+        command = draw(still, tiles=kinds, kind=kind).command
+        halted = (command[:, :2] == 0).all(dim=1)
+        assert share(halted) == pytest.approx(halts, abs=0.01)
+        assert share(command[halted][:, 2] != 0) == pytest.approx(turns, abs=0.02)

@@ -221,6 +221,16 @@ def test_who_was_told_to_stand_is_not_stuck():
     assert not any(bool(idle(environment)[2].any()) for _ in range(75))
 
 
+def test_no_robot_is_stuck_on_a_tile_that_does_not_say_so():
+    free = replace(STAIRS, tiles=(STAIRS.tiles[0], replace(STAIRS.tiles[1], stuck=False)))
+    environment = make(8, terrain=free, commands=forward_at(0.5), termination=STUCK)
+    ended = torch.zeros(8, dtype=torch.bool)
+    for _ in range(75):
+        ended |= idle(environment)[2].bool()
+    assert ended.tolist() == [environment.palette.tiles[kind].stuck for kind in environment.kind.tolist()]
+    assert 0 < ended.sum() < 8
+
+
 def test_being_stuck_ends_nothing_before_its_time_in_the_run():
     later = replace(STUCK, stuck_from=0.5)
     environment = make(

@@ -14,6 +14,7 @@ from gaitgauge.training.environment.reward_configuration import (
 )
 from gaitgauge.training.environment.rewards import REWARD_TERMS, RewardFunction
 from gaitgauge.training.environment.step_inputs import FootInputs, StepInputs
+from gaitgauge.training.environment.terrain_configuration import FLAT_TILE
 
 FEET = FootInputs(
     contact=torch.ones(2, 4, dtype=torch.bool),
@@ -64,6 +65,7 @@ def quiet():
         leave_distance=torch.full((2,), math.inf),
         episode_length=torch.ones(2, dtype=torch.int64),
         max_episode_length=1250,
+        can_be_stuck=torch.ones(2, dtype=torch.bool),
         shortfall=torch.zeros(2),
         diverged=torch.zeros(2, dtype=torch.bool),
         progress=torch.tensor(0.5),
@@ -232,7 +234,7 @@ def test_only_steps_under_a_command_are_paid_and_no_longer_than_the_longest(quie
 
 def test_weights_are_per_second_but_for_falls(quiet):
     settings = RewardConfiguration(termination=-5.0)
-    rewards = RewardFunction(settings, 0.02, "cpu")
+    rewards = RewardFunction(settings, 0.02, torch.zeros(2, dtype=torch.int64), [FLAT_TILE])
     inputs = replace(quiet, failed=torch.tensor([True, False]), base_height=torch.tensor([0.48, 0.38]))
     values = dict(zip(rewards.names, rewards(inputs, torch.tensor(0.0))[0].tolist(), strict=True))
     assert values["linear_tracking"] == pytest.approx(0.02)
@@ -243,11 +245,24 @@ def test_weights_are_per_second_but_for_falls(quiet):
 
 def test_weights_follow_progress(quiet):
     settings = RewardConfiguration(vertical_velocity=Ramp(start=-2.0, end=0.0, begin=0.25, until=0.75))
-    rewards = RewardFunction(settings, 1.0, "cpu")
+    rewards = RewardFunction(settings, 1.0, torch.zeros(2, dtype=torch.int64), [FLAT_TILE])
     inputs = replace(quiet, base_linear_velocity_b=one_world([0.0, 0.0, 1.0], 3))
     column = rewards.names.index("vertical_velocity")
     found = [float(rewards(inputs, torch.tensor(p))[0, column]) for p in (0.0, 0.25, 0.5, 0.75, 2.0)]
     assert found == pytest.approx([-2.0, -2.0, -1.0, 0.0, 0.0])
+
+
+def test_a_tile_pays_by_its_factors(quiet):
+    kinds = [FLAT_TILE, replace(FLAT_TILE, progress=0.0, yaw_tracking=1.5, linear_tracking=0.5)]
+    settings = RewardConfiguration(progress=2.0, yaw_tracking=1.0, linear_tracking=1.0)
+    rewards = RewardFunction(settings, 1.0, torch.tensor([0, 1]), kinds)
+    ahead = replace(quiet, command=one_world([1.0, 0.0, 0.0], 3), base_linear_velocity_b=one_world([1.0, 0.0, 0.0], 3))
+    paid = dict(zip(rewards.names, rewards(ahead, torch.tensor(0.0)).T.tolist(), strict=True))
+    assert [paid[name] for name in ("progress", "yaw_tracking", "linear_tracking")] == [
+        [2.0, 0.0],
+        [1.0, 1.5],
+        [1.0, 0.5],
+    ]
 
 
 def test_every_weight_names_a_term():

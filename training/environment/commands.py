@@ -12,6 +12,7 @@ import torch
 from ..configuration import ConfigurationError
 from .configuration import CommandConfiguration
 from .schedules import RampTable
+from .terrain_configuration import TileConfiguration
 
 COMMAND_COLUMNS = {
     "command_magnitude": 3,
@@ -56,6 +57,8 @@ class Ranges:
 
 _RANGE_WIDTHS = (3, 3, 2, 2, 1)
 """Columns of ``Ranges``, in order."""
+_MOVES = 0.01
+"""Square of the commanded speed from which there is something to reverse [m²/s² and rad²/s²]."""
 
 
 def _range_table(
@@ -90,8 +93,7 @@ class CommandGenerator:
         self,
         configuration: CommandConfiguration,
         *,
-        terrain_limits: Sequence[tuple[float, float, float]],
-        terrain_ends: Sequence[bool],
+        tiles: Sequence[TileConfiguration],
         control_period: float,
         max_episode_length: int,
         device: torch.device | str,
@@ -99,8 +101,7 @@ class CommandGenerator:
         """Put ranges on the device.
 
         Args:
-            terrain_limits: largest forward, lateral and yaw speed of each kind of terrain.
-            terrain_ends: whether the kind has an edge to be crossed.
+            tiles: kinds of terrain, in the order of their numbers.
             control_period: [s].
             max_episode_length: control steps in the longest episode.
 
@@ -115,23 +116,29 @@ class CommandGenerator:
         self._configuration = configuration
         begins = [stage.begin for stage in configuration.drawn_stages]
         self._begins = torch.tensor(begins, dtype=torch.float32, device=device)
-        self._table = _range_table(configuration, terrain_limits, control_period).to(device)
-        self._ends = torch.tensor(list(terrain_ends), device=device)
+        limits = [tile.command_limits for tile in tiles]
+        self._table = _range_table(configuration, limits, control_period).to(device)
+        self._ends = torch.tensor([tile.ends for tile in tiles], device=device)
         shares = (
             configuration.extreme_probability,
             configuration.straight_probability,
             configuration.flip_probability,
-            configuration.stationary_yaw_probability,
         )
         self._shares = torch.tensor(shares, device=device)
         self._stationary = RampTable([configuration.stationary_probability], device)
+        self._stationary_factor = torch.tensor([tile.stationary_probability for tile in tiles], device=device)
+        turning = [configuration.stationary_yaw_probability * tile.stationary_yaw_probability for tile in tiles]
+        self._turning = torch.tensor(turning, device=device)
+        self._reversal = torch.tensor([tile.reversal_probability for tile in tiles], device=device)
+        self._reverses = any(tile.reversal_probability > 0 for tile in tiles)
         # A number below the first bound sets an axis to zero, else one below the second bound to its lower limit.
         self._zero_below = torch.tensor(configuration.extreme_zero_probability, device=device)
         self._low_below = 0.5 * (1.0 + self._zero_below)
         self._period, self._length = control_period, max_episode_length
-        self.interval_steps = max(round(configuration.interval / control_period), 1)
         self._stationary_steps = round(configuration.stationary_longest / control_period)
-        self._interval = torch.tensor(self.interval_steps, device=device)
+        intervals = [tile.interval or configuration.interval for tile in tiles]
+        self._interval = torch.tensor(intervals, device=device)
+        self._interval_steps = (self._interval / control_period).round().long().clamp_min(1)
 
     def ranges(self, kind: torch.Tensor, progress: torch.Tensor) -> Ranges:
         """Return the range that the present stage allows each world."""
@@ -165,10 +172,12 @@ class CommandGenerator:
         settings, ranges = self._configuration, self.ranges(kind, progress)
         low, high = ranges.low, ranges.high
         remaining = (self._length - episode_length).clamp_min(1)
-        way = (settings.required_distance - issued.norm(dim=1) * settings.interval).clamp_min(0.0)
+        interval_steps = self._interval_steps[kind]
+        way = (settings.required_distance - issued.norm(dim=1) * self._interval[kind]).clamp_min(0.0)
         linear, yaw = self._uniform(uniform, ranges, way, remaining)
         kind_number = uniform["command_kind"]
-        extreme_drawn, straight, flipped, turning = (kind_number < self._shares).unbind(1)
+        extreme_drawn, straight, flipped = (kind_number[:, :3] < self._shares).unbind(1)
+        turning = kind_number[:, 3] < self._turning[kind]
 
         # Extreme: every axis at a limit or zero. Opposite: what the gauge does halfway through each of its diagonal commands.
         corner = uniform["command_corner"]
@@ -184,7 +193,7 @@ class CommandGenerator:
         # Stationary: as long as the rest of the episode still allows the required way at 80 % of the highest speed.
         spare = remaining - (way / ranges.reach).ceil().long()
         stationary_steps = spare.clamp(max=self._stationary_steps)
-        stationary_probability = self._stationary.at(progress)[0]
+        stationary_probability = self._stationary.at(progress)[0] * self._stationary_factor[kind]
         is_stationary = ~is_extreme & (stationary_steps > 0)
         is_stationary &= kind_number[:, 0] < settings.extreme_probability + stationary_probability
 
@@ -192,7 +201,7 @@ class CommandGenerator:
         yaw = yaw.masked_fill(torch.where(is_stationary, ~turning, straight)[:, None], 0.0)
         drawn = torch.where(is_extreme[:, None], extremes, torch.cat((linear, yaw), dim=1))
         drawn = torch.where(is_opposite[:, None], opposite, drawn)
-        steps = torch.where(is_stationary, stationary_steps, self._interval)
+        steps = torch.where(is_stationary, stationary_steps, interval_steps)
         holds_heading = straight & ~is_stationary & ~is_extreme
 
         # Crossing: straight on or back for the whole episode, on ground that has an edge to come to.
@@ -206,6 +215,18 @@ class CommandGenerator:
             drawn = torch.where(crosses[:, None], straight_on, drawn)
             steps = torch.where(crosses, remaining, steps)
             is_extreme, holds_heading = is_extreme & ~crosses, holds_heading | crosses
+
+        # Reversal: back at once. Crossings are drawn at the start of an episode alone, so their numbers are free later.
+        if self._reverses:
+            chance, straight_back, _ = uniform["command_crossing"].unbind(1)
+            moves = command.square().sum(dim=1) > _MOVES
+            reverses = (episode_length > 0) & (chance < self._reversal[kind]) & moves
+            back = (straight_back < 0.5) & (command[:, :2].square().sum(dim=1) > _MOVES)
+            reversed_ = torch.cat((opposite[:, :2], opposite[:, 2:].masked_fill(back[:, None], 0.0)), dim=1)
+            drawn = torch.where(reverses[:, None], reversed_, drawn)
+            steps = torch.where(reverses, interval_steps, steps)
+            is_extreme = torch.where(reverses, extreme, is_extreme)
+            holds_heading = torch.where(reverses, back, holds_heading)
         return CommandDraw(command=drawn, steps=steps, extreme=is_extreme, holds_heading=holds_heading)
 
     def held_yaw_rate(self, off: torch.Tensor, *, kind: torch.Tensor, progress: torch.Tensor) -> torch.Tensor:

@@ -6,7 +6,7 @@ Formulas follow the paper's table of rewards in the reading of the published cod
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 import torch
 
@@ -17,6 +17,7 @@ from .own_terms import resolve_own
 from .reward_configuration import RewardWeights
 from .schedules import RampTable
 from .step_inputs import StepInputs
+from .terrain_configuration import TileConfiguration
 
 SLOWEST_COMMAND = 0.1
 """Commanded speed below which nothing is asked of a robot's progress [m/s]."""
@@ -196,11 +197,24 @@ REWARD_TERMS: Mapping[str, RewardTerm] = {
 """All terms by the names of their weights in ``RewardWeights``, which adds those of one's own."""
 
 
+PAID_BY_TILE = ("linear_tracking", "yaw_tracking", "progress")
+"""Terms with a factor for each kind of tile, under the same name in ``TileConfiguration``."""
+
+
 class RewardFunction:
     """Weighted sum of the terms with a weight other than zero."""
 
-    def __init__(self, configuration: RewardWeights, control_period: float, device: torch.device | str) -> None:
-        """Choose the terms and put their weights on the device. Raises ConfigurationError: a term of one's own is not there."""
+    def __init__(
+        self,
+        configuration: RewardWeights,
+        control_period: float,
+        kind: torch.Tensor,
+        tiles: Sequence[TileConfiguration],
+    ) -> None:
+        """Choose the terms and put their weights on the device of ``kind``, the kind of tile of each world, (N,) int64, out of ``tiles``.
+        Raises ConfigurationError: a term of one's own is not there.
+        """
+        device = kind.device
         own = resolve_own(
             configuration.own,
             "environment.rewards.own",
@@ -218,8 +232,12 @@ class RewardFunction:
         # The termination penalty is per fall; all other weights are per second.
         period = [1.0 if name == "termination" else control_period for name in self.names]
         self._period = torch.tensor(period, device=device)
+        rows = [[getattr(tile, name) if name in PAID_BY_TILE else 1.0 for name in self.names] for tile in tiles]
+        factors = torch.tensor(rows)
+        self._factors = factors.to(device)[kind] if bool((factors != 1.0).any()) else None
 
     def __call__(self, inputs: StepInputs, progress: torch.Tensor) -> torch.Tensor:
         """Weighted rewards of every term, (N, terms), at a fraction of the run (scalar tensor)."""
         values = torch.stack([term(inputs) for term in self._terms], dim=1)
-        return values * (self._weights.at(progress) * self._period)
+        weights = self._weights.at(progress) * self._period
+        return values * (weights if self._factors is None else weights * self._factors)

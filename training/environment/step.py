@@ -96,13 +96,12 @@ class EnvironmentStep:
             scan=self.scan,
             rasters=rasters,
         )
-        self.rewards = RewardFunction(configuration.rewards, period, device)
+        self.rewards = RewardFunction(configuration.rewards, period, kind, palette.tiles)
         self.terminations = Terminations(configuration.termination)
         drawn, where = configuration.commands, "environment.commands.generator"
         self.commands = resolve_class(drawn.generator, where, CommandGenerator, "draw", "held_yaw_rate")(
             drawn,
-            terrain_limits=[tile.command_limits for tile in palette.tiles],
-            terrain_ends=[tile.ends for tile in palette.tiles],
+            tiles=palette.tiles,
             control_period=period,
             max_episode_length=self.max_episode_length,
             device=device,

@@ -122,6 +122,8 @@ class StepInputs:
     """Control steps of the present episode, (N,) int64."""
     max_episode_length: int
     """Control steps of the longest episode."""
+    can_be_stuck: torch.Tensor
+    """Worlds on tiles on which being stuck ends an episode, (N,) bool."""
     shortfall: torch.Tensor
     """Share of the commanded speed that is missing of late, an exponential average, (N,)."""
     diverged: torch.Tensor

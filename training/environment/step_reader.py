@@ -86,6 +86,7 @@ class StepReader:
         leave = configuration.terrain.leave_distance
         distance = [leave if leave is not None and tile.ends else math.inf for tile in tiles]
         self._leave = torch.tensor(distance, device=device)[kind]
+        self._can_be_stuck = torch.tensor([tile.stuck for tile in tiles], device=device)[kind]
 
     def _speed_limit(self, robot: Robot, parameters: JointParameters) -> torch.Tensor:
         if not self._settings.joint_speed_limits:
@@ -171,6 +172,7 @@ class StepReader:
             leave_distance=self._leave,
             episode_length=memory.episode_length,
             max_episode_length=self._longest,
+            can_be_stuck=self._can_be_stuck,
             shortfall=memory.shortfall,
             diverged=diverged,
             progress=progress,

@@ -56,7 +56,7 @@ def stuck(inputs: StepInputs, settings: TerminationConfiguration) -> torch.Tenso
     assert settings.stuck is not None
     missing = torch.where(commanded_to_move(inputs.command), 1.0 - progress_share(inputs), 0.0).nan_to_num(0.0)
     inputs.shortfall.lerp_(missing, 1.0 - (1.0 - STUCK_SHORTFALL) ** (inputs.period / settings.stuck))
-    return (inputs.shortfall > STUCK_SHORTFALL) & (inputs.progress >= settings.stuck_from)
+    return (inputs.shortfall > STUCK_SHORTFALL) & (inputs.progress >= settings.stuck_from) & inputs.can_be_stuck
 
 
 def diverged(inputs: StepInputs, settings: TerminationConfiguration) -> torch.Tensor:

@@ -16,7 +16,9 @@ _Spread = Annotated[float, Field(ge=0.0, le=100.0)]
 
 @dataclass(frozen=True, kw_only=True)
 class TileConfiguration:
-    """One kind of training tile."""
+    """One kind of training tile: its share, the commands on it, and factors on the settings of the same names in ``rewards`` and
+    ``commands``.
+    """
 
     name: str
     """A kind out of ``terrains.training_tiles.TILE_KINDS``."""
@@ -28,6 +30,22 @@ class TileConfiguration:
     """Largest tracking sigma on this kind (``RewardConfiguration.dynamic_sigma``)."""
     ends: bool = True
     """True if the kind has an edge, at which ``TerrainConfiguration.leave_distance`` acts and to which crossings lead."""
+    linear_tracking: NotNegative = 1.0
+    """Factor on the weight ``rewards.linear_tracking``."""
+    yaw_tracking: NotNegative = 1.0
+    """Factor on the weight ``rewards.yaw_tracking``."""
+    progress: NotNegative = 1.0
+    """Factor on the weight ``rewards.progress``."""
+    stationary_probability: NotNegative = 1.0
+    """Factor on the share of stationary commands."""
+    stationary_yaw_probability: NotNegative = 1.0
+    """Factor on the share of those that turn on the spot."""
+    interval: Positive | None = None
+    """Time between two draws of commands [s]; None for ``commands.interval``."""
+    reversal_probability: Share = 0.0
+    """Chance that the opposite of a command follows it; in half of the cases without its yaw rate, at the heading of that moment."""
+    stuck: bool = True
+    """True if ``termination.stuck`` ends episodes."""
 
 
 _MODERATE, _SLOW, _STRAIGHT = (1.5, 1.0, 1.5), (1.0, 1.0, 1.5), (1.0, 0.5, 1.5)

@@ -25,7 +25,7 @@ from ..environment.configuration import (
     TerminationConfiguration,
 )
 from ..environment.reward_configuration import RewardConfiguration
-from ..environment.terrain_configuration import FLAT_TILE, TerrainConfiguration
+from ..environment.terrain_configuration import ALL_TILES, FLAT_TILE, TerrainConfiguration
 from ..overrides import TaskError, apply_overrides
 from . import biped
 from .scaling import scaled
@@ -92,8 +92,19 @@ class _Settings:
 
 
 _MIRRORED = AlgorithmConfiguration(symmetry="augment", student_period=2)
+_PRECISE_GROUND = replace(
+    FLAT_TILE,
+    # Pay for progress asks for at least the commanded speed; where nothing is to be climbed, tracking pays alone.
+    progress=0.0,
+    interval=3.0,
+    reversal_probability=0.5,
+    stationary_probability=2.0,
+    stationary_yaw_probability=2.0,
+)
+"""Level ground beside ground that is to be climbed: reversals, standing and turns on the spot are learned here."""
 _ALL_TERRAINS = EnvironmentConfiguration(
     num_envs=16384,
+    terrain=TerrainConfiguration(tiles=(*ALL_TILES[:-1], _PRECISE_GROUND)),
     rewards=RewardConfiguration(
         yaw_tracking=0.75, progress=1.5, collision=-0.25, foot_regulation=-0.1, foot_height_scale=0.05
     ),
