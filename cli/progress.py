@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any, ClassVar
 
 from rich.console import Group, RenderableType
 from rich.live import Live
@@ -28,6 +29,9 @@ _LEAST = 1.0
 class ProgressDisplay:
     """Show the progress of a ``with`` block; between two updates the remaining time counts down."""
 
+    _first: ClassVar[ProgressDisplay | None] = None
+    """The display of a command that has not begun its work; the one of the work takes its place and its clock."""
+
     def __init__(self, console: Terminal, title: str, *, clock: Callable[[], float] = time.monotonic) -> None:
         """Prepare the display; ``clock`` gives the time [s]."""
         self._console, self._title, self._clock = console, title, clock
@@ -40,19 +44,48 @@ class ProgressDisplay:
         self._lines = threading.Thread(target=self._tell_now_and_then, daemon=True)
 
     def __enter__(self) -> ProgressDisplay:
-        if self._console.is_terminal:
-            self._live = Live(console=self._console, refresh_per_second=4, get_renderable=self._block)
-            self._live.__enter__()
-        else:
-            self._lines.start()
+        first, ProgressDisplay._first = self._first, None
+        if first is not None:
+            self._began, self._told = first._began, first._told
+            first.close()
+        self._open()
         return self
 
     def __exit__(self, *details: Any) -> None:
+        self.close()
+
+    def _open(self, *, transient: bool = False) -> None:
+        if self._console.is_terminal:
+            self._live = Live(
+                console=self._console,
+                refresh_per_second=4,
+                get_renderable=self._block,
+                redirect_stdout=not transient,
+                transient=transient,
+            )
+            self._live.start()
+        else:
+            self._lines.start()
+
+    def close(self) -> None:
+        """End the display; once is enough."""
         self._stop.set()
         if self._live is not None:
-            self._live.__exit__(*details)
-        else:
+            self._live.stop()
+        elif self._lines.is_alive():
             self._lines.join()
+
+    @classmethod
+    @contextmanager
+    def of_start(cls, console: Terminal, title: str, *, clock: Callable[[], float] = time.monotonic) -> Iterator[None]:
+        """Show that a command reads files and imports packages, until it shows its own progress."""
+        ProgressDisplay._first = first = cls(console, title, clock=clock)
+        first._open(transient=True)
+        try:
+            yield
+        finally:
+            ProgressDisplay._first = None
+            first.close()
 
     def update(
         self,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import inspect
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import MISSING, is_dataclass
 from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 
@@ -13,12 +14,14 @@ from annotated_types import Ge, Le
 
 from ..files.choices import choice_of, choices
 from . import completion
+from .console import Terminal
 from .errors import report_errors
+from .progress import ProgressDisplay
 
 Command = Callable[..., None]
 
 
-def command(app: typer.Typer, name: str | None = None) -> Callable[[Command], Command]:
+def command(app: typer.Typer, name: str | None = None, *, long: bool = False) -> Callable[[Command], Command]:
     """Register a function as a command of ``app``; its docstring is the help.
 
     Each parameter with a ``Choice`` is an option or an argument. A parameter that is a dataclass of choices stands for all of
@@ -26,6 +29,7 @@ def command(app: typer.Typer, name: str | None = None) -> Callable[[Command], Co
 
     Args:
         name: of the command; None for the function's own.
+        long: it shows its progress, and that it starts until then.
     """
 
     def register(function: Command) -> Command:
@@ -49,7 +53,8 @@ def command(app: typer.Typer, name: str | None = None) -> Callable[[Command], Co
                 argument: request(**{field: values.pop(field) for field in choices(request)})
                 for argument, request in requests.items()
             }
-            function(**made, **values)
+            with ProgressDisplay.of_start(Terminal(stderr=True), function.__name__) if long else nullcontext():
+                function(**made, **values)
 
         functools.update_wrapper(run, function)
         run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}

@@ -32,7 +32,7 @@ _EXAMPLE = Choice("Tables that ship with the project: paper.", values=("paper",)
 _SCALES = "Values are on different scales: compare the order of policies alone."
 
 
-@command(app)
+@command(app, long=True)
 def evaluate(
     request: Request,
     out: Annotated[Path | None, output("results/<policy>-<suite>-<pipeline>")] = None,
@@ -52,7 +52,7 @@ def evaluate(
     run_evaluation(request, out=out, resume=resume, clip=clip, json_output=json_output)
 
 
-@command(app)
+@command(app, long=True)
 def compare(
     contestants: Annotated[tuple[str, ...], Choice(_CONTESTANTS, None, "policies", "A B...")],
     choices: EvaluationOptions,
@@ -71,7 +71,7 @@ def compare(
     run_comparison(contestants, choices, out=out, json_output=json_output)
 
 
-@command(app)
+@command(app, long=True)
 def verify(request: VerifyRequest) -> None:
     """Play a score card again and say whether it holds on this machine; exit code 1 where it does not.
 
@@ -121,7 +121,7 @@ def validate(
     run_validation(tables, example_name=example_name, ranks_only=ranks_only, json_output=json_output)
 
 
-@command(app)
+@command(app, long=True)
 def jury(
     request: JuryRequest,
     engines: Annotated[str, Choice(_JURY, PLACE, "backends")] = "",
@@ -140,7 +140,7 @@ def jury(
     run_jury(request, engines, out=out, resume=resume, json_output=json_output)
 
 
-@command(app)
+@command(app, long=True)
 def consistency(
     request: StudyRequest,
     backends: Annotated[str, Choice(_ENGINES, PLACE, "backends")] = "",
@@ -159,7 +159,7 @@ def consistency(
     run_consistency(request, backends, out=out, resume=resume, json_output=json_output)
 
 
-@command(app)
+@command(app, long=True)
 def trial(
     request: TrialRequest,
     out: Annotated[Path | None, output("results/trial-<policies>")] = None,
@@ -176,7 +176,7 @@ def trial(
     run_trial(request, out=out, json_output=json_output)
 
 
-@command(app)
+@command(app, long=True)
 def worst(
     request: WorstRequest,
     others: Annotated[str | None, Choice(_OTHERS, PLACE, "backends")] = None,
@@ -196,7 +196,7 @@ def worst(
     run_worst(request, others, films=films, out=out, resume=resume, json_output=json_output)
 
 
-@command(app)
+@command(app, long=True)
 def latent(
     request: LatentRequest,
     out: Annotated[Path | None, output("results/latent-<policies>")] = None,

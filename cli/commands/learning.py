@@ -40,7 +40,7 @@ def train(
         run_training(request, time)
 
 
-@command(app)
+@command(app, long=True)
 def sweep(request: SweepRequest) -> None:
     """Train a list of tasks, settings and seeds on the GPUs there are, gauge each, and compare; goes on where it stopped.
 

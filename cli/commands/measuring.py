@@ -19,7 +19,7 @@ _SETS = "Two or more parameter sets or their files; differences are to the first
 _MEASURED = "Folder of the comparison and its evaluations. Default: results/measured-<policy>, and results/."
 
 
-@command(app)
+@command(app, long=True)
 def replay(
     request: ReplayRequest,
     out: Annotated[Path | None, output("results/replay-<log>")] = None,
@@ -36,7 +36,7 @@ def replay(
     run_replay(request, out=out, json_output=json_output)
 
 
-@command(app)
+@command(app, long=True)
 def identify(
     request: IdentifyRequest,
     out: Annotated[Path | None, output("results/identify-<log>")] = None,

@@ -94,6 +94,38 @@ def test_no_display_is_silent_while_nothing_is_heard(monkeypatch):
     assert shown(show).splitlines() == [*lines, "45 s: gauging, 1 of 2, about 1 s left"]
 
 
+def test_a_command_is_not_silent_while_it_imports_and_reads(monkeypatch):
+    """Nothing was shown for 69 s on a busy machine until the first display; its clock goes on from the command's start."""
+    monkeypatch.setattr("gaitgauge.cli.progress._TICK", 0.001)
+    now = 0.0
+
+    def show(terminal):
+        nonlocal now
+        with ProgressDisplay.of_start(terminal, "evaluate", clock=lambda: now):
+            for now in (9.0, 18.0):
+                _until(terminal, f"{now:g} s: ")
+            with ProgressDisplay(terminal, "gauging", clock=lambda: now) as display:
+                now = 27.0
+                display.update(0.5, "1 of 2", left=25.0)
+        with ProgressDisplay(terminal, "another", clock=lambda: now) as display:
+            display.update(1.0, "1 of 1", last=True)
+
+    lines = "9 s: evaluate, starting", "18 s: evaluate, starting", "27 s: gauging, 1 of 2, about 25 s left"
+    assert shown(show).splitlines() == [*lines, "0 s: another, 1 of 1"]
+
+
+STARTED = "evaluate p|compare p q|verify c|jury p|consistency p|trial p|worst p|latent p|sweep s|replay r --robot go2"
+
+
+@pytest.mark.parametrize("arguments", [line.split() for line in STARTED.split("|")], ids=lambda line: line[0])
+def test_commands_that_take_long_say_so_from_the_start(refused, monkeypatch, arguments):
+    def of_start(console, title):
+        raise UserError(f"{title} shows that it starts")
+
+    monkeypatch.setattr(ProgressDisplay, "of_start", of_start)
+    assert f"{arguments[0]} shows that it starts" in refused(*arguments)
+
+
 def _until(terminal, text):
     """Wait until a terminal shows a text."""
     for _ in range(5000):
