@@ -167,22 +167,30 @@ def _lowest(compiled: mujoco.MjModel, data: mujoco.MjData, geom: int) -> float:
     return float(data.geom_xpos[geom, 2] + up @ center - np.abs(up) @ half)
 
 
+def write(models: Path, folder: Path) -> Path:
+    """Write the robot that a folder is named after, with its model, into the folder; return its ``robot.toml``."""
+    name = folder.name
+    folder.mkdir(parents=True, exist_ok=True)
+    root = model(models / SOURCES[name], name)
+    ElementTree.indent(root)
+    text = ElementTree.tostring(root, encoding="unicode")
+    (folder / f"{name}.xml").write_text(text, encoding="utf-8")
+    written = folder / "robot.toml"
+    compiled = mujoco.MjModel.from_xml_string(text)
+    written.write_text(description(compiled, name, f"{name}.xml"), encoding="utf-8")
+    return written
+
+
 def main() -> None:
     """Write all robots that there are models for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("models", type=Path)
     parser.add_argument("out", type=Path)
     arguments = parser.parse_args()
-    for name, file in SOURCES.items():
-        folder = arguments.out / name
-        folder.mkdir(parents=True, exist_ok=True)
-        root = model(arguments.models / file, name)
-        ElementTree.indent(root)
-        text = ElementTree.tostring(root, encoding="unicode")
-        (folder / f"{name}.xml").write_text(text, encoding="utf-8")
-        compiled = mujoco.MjModel.from_xml_string(text)
-        (folder / "robot.toml").write_text(description(compiled, name, f"{name}.xml"), encoding="utf-8")
-        print(f"{folder / 'robot.toml'}: {compiled.njnt - 1} joints, {compiled.body_mass.sum():.2f} kg")
+    for name in SOURCES:
+        written = write(arguments.models, arguments.out / name)
+        compiled = mujoco.MjModel.from_xml_path(str(written.parent / f"{name}.xml"))
+        print(f"{written}: {compiled.njnt - 1} joints, {compiled.body_mass.sum():.2f} kg")
 
 
 if __name__ == "__main__":

@@ -1,11 +1,13 @@
-"""Make the score cards that ship: a robot that stands, the hand-made trot, a published CTS policy and those that ship.
+"""Make the score cards that ship: a robot that stands, the hand-made trot, a published CTS policy, those that ship, the zoo's.
 
     python benchmarks/score_cards.py --threads 13 --folder /tmp/cards --cts go2_cts_public.npz --out docs/data/scorecards
+    python benchmarks/score_cards.py --threads 13 --folder /tmp/cards --public FOLDER --suite robogauge-1.1.8 --out cards
 
 Each policy is evaluated on each suite, whole; what the folder holds is not played again. A card is the run's ``results.json``
 with the policy's name in place of its path and without the machine's name, with the band in which the score of a replay on
 another machine must lie, and with the repeatability of its suite (``--repeatability``). Weights of others are not written to
-``--out``: of the CTS policy its card alone. ``--only`` and ``--suite`` choose, so that several processes can share the work;
+``--out``: of the CTS policy and the zoo's their cards alone. ``--public`` is a folder with public files that the zoo knows, under
+any name, and takes those for the Go2. ``--only`` and ``--suite`` choose, so that several processes can share the work;
 ``--terrain`` and ``--friction`` take a part for a first try.
 
 ``--made`` plays nothing: cards are made of the results that the folder holds, on this machine or on another that was given the
@@ -32,13 +34,16 @@ from gaitgauge.gauge.result import Result
 from gaitgauge.gauge.store import StoreError
 from gaitgauge.policy.contract import standard_contract
 from gaitgauge.policy.finding import shipped_policies
+from gaitgauge.policy.foreign.zoo import zoo
 from gaitgauge.policy.native import StoredNetwork, save_policy
 from gaitgauge.policy.networks.architectures import MlpNetwork
 from gaitgauge.robots import load_robot
 from gaitgauge.studies.cards.verify import tolerance_band
 from gaitgauge.studies.compare.comparison import load_result
+from gaitgauge.studies.policies import file_digest
 
 NAMES = ("standing", "trotting", "cts", *shipped_policies())
+ZOO = {known.name: known for known in zoo().values() if known.robot == "go2"}
 SUITES = ("robogauge-1.1", "gaitgauge-1")
 
 
@@ -75,7 +80,9 @@ def card_of(result: Result, name: str, repeated: dict[str, Any] | None, commit: 
         repeated: what ``benchmarks/repeatability.py`` wrote.
         commit: the one that played, where the results do not know.
     """
-    path = name if name in shipped_policies() else f"{name}.gauge.pt"
+    path = (
+        name if name in shipped_policies() else f"{name}{Path(ZOO[name].file).suffix if name in ZOO else '.gauge.pt'}"
+    )
     provenance = replace(
         result.provenance,
         command=f"gaitgauge evaluate {path} --suite {result.suite.name}",
@@ -94,7 +101,13 @@ def card_of(result: Result, name: str, repeated: dict[str, Any] | None, commit: 
 def play(name: str, suite: str, run: Path, arguments: argparse.Namespace) -> Result:
     """Evaluate a policy on a suite."""
     policy = name
-    if name not in shipped_policies():
+    if name in ZOO:
+        files = (file for file in arguments.public.rglob("*") if file.is_file())
+        found = next((file for file in files if file_digest(str(file)) == ZOO[name].sha256), None)
+        if found is None:
+            raise SystemExit(f"'{arguments.public}' holds no file of '{name}' (SHA-256 {ZOO[name].sha256})")
+        policy = str(found)
+    elif name not in shipped_policies():
         path = arguments.folder / f"{name}-{suite}.gauge.pt"
         make_policy(name, path, arguments.cts)
         policy = str(path)
@@ -118,15 +131,21 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="where the cards go")
     parser.add_argument("--cts", type=Path, help="NumPy archive of the published CTS policy's weights")
     parser.add_argument(
+        "--public", type=Path, help="folder of public files that the zoo knows; takes those for the Go2"
+    )
+    parser.add_argument(
         "--repeatability", type=Path, help="figures that benchmarks/repeatability.py wrote, for the cards"
     )
     parser.add_argument("--made", action="store_true", help="take the results that the folder holds, play nothing")
     parser.add_argument("--commit", help="commit of the source that played, where the results do not know it")
-    parser.add_argument("--only", nargs="+", choices=NAMES, default=list(NAMES))
+    parser.add_argument("--only", nargs="+", choices=(*NAMES, *ZOO))
     parser.add_argument("--suite", nargs="+", default=list(SUITES))
     parser.add_argument("--terrain", action="append", default=[])
     parser.add_argument("--friction", action="append", type=float, default=[])
     arguments = parser.parse_args()
+    arguments.only = arguments.only or list(ZOO if arguments.public is not None else NAMES)
+    if arguments.public is None and not arguments.made and set(arguments.only) & set(ZOO):
+        parser.error("the cards of the zoo's policies need their files; give their folder as --public")
     if "cts" in arguments.only and arguments.cts is None and not arguments.made:
         parser.error("the card of 'cts' needs the archive of its weights; give --cts, or choose others with --only")
     repeated = None
