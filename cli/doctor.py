@@ -21,6 +21,7 @@ from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 from rich.text import Text
 
+from ..files.choices import cores
 from . import picture
 from .console import Terminal, make_table, print_json
 from .errors import UserError
@@ -196,7 +197,7 @@ def check_mujoco() -> Iterator[Finding]:
         return
     package, library = answer
     if package == library:
-        yield Finding(what, OK, f"{library}, mujoco.batch, {os.cpu_count()} CPU threads")
+        yield Finding(what, OK, f"{library}, mujoco.batch, {cores()} CPU threads")
     else:
         advice = "another MuJoCo comes first: unset LD_LIBRARY_PATH and MUJOCO_PATH"
         yield Finding(what, PROBLEM, f"package {package} loads library {library}", advice)

@@ -15,6 +15,7 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
+from ..files.choices import cores
 from .errors import UserError
 from .picture import PLAIN, Picture, Quality, Tile
 
@@ -41,8 +42,7 @@ class Shot(Generic[Note]):
 
 def processes_for(pictures: int, quality: Quality) -> int:
     """Return the number of processes that draw; 0: this one."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    wanted = min(_MOST, cores, pictures // _WORTH)
+    wanted = min(_MOST, cores(), pictures // _WORTH)
     return wanted if quality is PLAIN and wanted > 1 else 0
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time as clock
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -11,6 +10,7 @@ from typing import Any
 
 import typer
 
+from ..files.choices import cores
 from ..gauge.play.cluster import check_address
 from ..training.sweep.call import Kept, work_through
 from ..training.sweep.file import load_sweep
@@ -40,7 +40,7 @@ def run_sweep(asked: SweepRequest) -> None:
         done = work_through(
             sweep,
             folder,
-            threads=threads or max((os.cpu_count() or 2) // 2, 1),
+            threads=threads or max(cores() // 2, 1),
             per_gpu=asked.per_gpu,
             gauging=gauging,
             deadline=deadline,

@@ -10,6 +10,7 @@ from pathlib import Path
 import torch
 
 from ..backends.base import TRAINING_PHYSICS, Scene
+from ..files.choices import cpu_threads
 from ..gauge.suite import load_suite
 from ..robots import Robot, load_robot
 from ..terrains.gauge_terrains import LEVELS
@@ -62,7 +63,7 @@ def run_warmup(
         console.say(f"{name}: {len(launched)} modules are launched (seen on the CPU in {seconds:.0f} s)")
         for number in numbers:
             with console.status(f"{name}: compiling for sm_{number} …"):
-                done = warmup.compile_for(number, launched, threads=threads or os.cpu_count() or 1)
+                done = warmup.compile_for(number, launched, threads=cpu_threads(threads))
             counts = f"{done.fresh} of {done.modules} compiled, the others were there"
             console.say(f"{name}, sm_{number}: {counts} ({done.seconds:.0f} s)")
     console.say(f"kernels are in {warmup.cache_folder()}")

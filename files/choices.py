@@ -58,9 +58,14 @@ def choice_of(hint: Any) -> Choice | None:
     return next((part for part in reversed(getattr(hint, "__metadata__", ())) if isinstance(part, Choice)), None)
 
 
+def cores() -> int:
+    """Return the number of cores that this process may use: a job on a cluster has fewer than its machine."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def cpu_threads(asked: int | None) -> int:
     """Return the requested number of CPU threads; None stands for all cores."""
-    return asked or os.cpu_count() or 1
+    return asked or cores()
 
 
 @cache

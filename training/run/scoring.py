@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from ...files.choices import cores
 from ...files.parsing import read_results
 from ...gauge.result import Result
 from ...gauge.suite import load_suite
@@ -46,7 +46,7 @@ class Scorer:
         self.suite = load_suite(suite).name
         """Name in the log keys ``Gauge/<suite>/<score>``."""
         self._asked = suite
-        self._threads = threads or max(1, (os.cpu_count() or 2) // 2)
+        self._threads = threads or max(1, cores() // 2)
         self._folder = run / GAUGE_FOLDER / self.suite
         self._side = SideProcess()
 
