@@ -13,7 +13,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from ...backends.base import TRAINING_PHYSICS, PhysicsOptions
-from ...files.parsing import Count, NotNegative, Positive, Seed, Share
+from ...files.parsing import Count, NotNegative, Positive, Seed, Share, Text
 from ...robots.base import Angle, Damping, Inertia, Torque
 from ..configuration import Ramp, Range, check_rising
 from .reward_configuration import DEFAULT_REWARDS, Extent, Metres, RewardConfiguration
@@ -319,6 +319,13 @@ class EnvironmentConfiguration:
     termination: TerminationConfiguration = TerminationConfiguration()
     events: tuple[OwnEvent, ...] = ()
     """Events of one's own."""
+    scenarios: tuple[Text, ...] = ()
+    """Scenario files that some worlds play, such as ``gaitgauge worst`` writes; a folder stands for its TOML files."""
+    scenario_share: Annotated[float, Field(gt=0.0, le=0.9)] = 0.2
+    """Share of the worlds that play ``scenarios``, the same number for each file; an episode there lasts as long as its commands."""
+    scenario_variation: Annotated[float, Field(ge=0.0, le=0.9)] = 0.1
+    """Largest share by which commands, forces, loads, friction and latency differ from the file's, and moments, in seconds; loads differ
+    from world to world, all else from episode to episode."""
     log_interval: Count = 8
     """Environment steps between two logs of finished episodes; each log costs the learner's logger time."""
 

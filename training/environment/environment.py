@@ -35,6 +35,7 @@ from .memory import copied, fitting, restore
 from .observations import Observations
 from .own_terms import resolve_own
 from .policy_interface import driven_robot, joint_parameters, training_contract
+from .scenarios import read_scenarios, with_scenarios
 from .step import EnvironmentStep, StepResult
 from .step_inputs import AFTER_RESET, AFTER_STEP, static_inputs
 
@@ -99,6 +100,9 @@ class TrainingEnvironment(VecEnv):
         self.robot = whole if self._model_folder is None else welded(whole, Path(self._model_folder.name))
         parameters = joint_parameters(self.robot, configuration)
         self.palette = build_palette(configuration.terrain)
+        scenarios = read_scenarios(configuration)
+        if scenarios:
+            self.palette = with_scenarios(self.palette, scenarios, configuration)
         kind = assign_kinds([tile.share for tile in self.palette.tiles], configuration.num_envs)
         level = self._start_levels(configuration)
         scene = Scene(
@@ -125,6 +129,7 @@ class TrainingEnvironment(VecEnv):
             kind=kind.to(self.device),
             inputs=self._inputs,
             generator=self._generator,
+            scenarios=scenarios,
         )
         self.max_episode_length = self.parts.max_episode_length
         self.kind = self.parts.kind
@@ -133,6 +138,8 @@ class TrainingEnvironment(VecEnv):
         self._bodies = draw_bodies(
             configuration.randomization, self.num_envs, len(self.robot.collision_bodies), self._generator
         )
+        if self.parts.scenarios is not None:
+            self.parts.scenarios.load(self._bodies, self._generator)
         self.backend.randomize(Randomization(**self._bodies))
         schedule = configuration.schedule
         if not 0.0 <= schedule.begin <= 1.0:
@@ -178,7 +185,10 @@ class TrainingEnvironment(VecEnv):
     @contextmanager
     def _trial(self) -> Iterator[None]:
         """Let both torch parts run inside the context; their changes are put back."""
-        tensors = self.parts.memory.by_name() | {f"motors.{name}": v for name, v in self.parts.motors.by_name().items()}
+        parts = self.parts
+        tensors = parts.memory.by_name() | {f"motors.{name}": v for name, v in parts.motors.by_name().items()}
+        if parts.scenarios is not None:
+            tensors |= {f"scenarios.{name}": v for name, v in parts.scenarios.by_name().items()}
         before = copied(tensors)
         try:
             with torch.no_grad():
@@ -238,7 +248,11 @@ class TrainingEnvironment(VecEnv):
         parts = self.parts
         parts.action.copy_(actions)
         parts.uniform.draw()
-        self.backend.step(parts.targets(), delay=parts.delay())
+        targets, delay = parts.targets(), parts.delay()
+        if parts.scenarios is not None:
+            parts.scenarios.apply(self.backend, self._bodies["friction"])
+            targets, delay = parts.scenarios.late(targets, delay)
+        self.backend.step(targets, delay=delay)
         self._read(AFTER_STEP)
         result = self._after_physics()
         self.common_step_counter += 1
@@ -281,6 +295,8 @@ class TrainingEnvironment(VecEnv):
     def _log(self) -> dict[str, torch.Tensor]:
         """Return the figures since the last log, as tensors on the device."""
         log = self.parts.log.read(self.parts.memory, self.progress)
+        if self.parts.scenarios is not None:
+            log |= self.parts.scenarios.log()
         return log | {"Physics/overflow_worlds": self.backend.state.overflowed.sum().float()}
 
     # --- resuming ---------------------------------------------------------------------------------------------------
@@ -309,6 +325,7 @@ class TrainingEnvironment(VecEnv):
             "version": STATE_VERSION,
             "memory": copied(self.parts.memory.by_name()),
             "motors": copied(self.parts.motors.by_name()),
+            "scenarios": {} if self.parts.scenarios is None else copied(self.parts.scenarios.by_name()),
             "bodies": copied(self._bodies),
             "observations": copied(vars(self._observations)),
             "generator": self._generator.get_state(),
@@ -345,11 +362,14 @@ class TrainingEnvironment(VecEnv):
         restore({"motor_speed": torch.ones_like(motors["motor_speed"]), **state["motors"]}, motors)
         self._take_bodies(state["bodies"])
         parts.motors.apply(self.backend)
+        if parts.scenarios is not None:
+            restore(state["scenarios"], parts.scenarios.by_name())
         self._observations = Observations(**fitting(state["observations"], vars(self._observations))).clone()
         self._generator.set_state(state["generator"].cpu())
         self.common_step_counter = int(state["common_step_counter"])
         physics = fitting(state["physics"], {name: getattr(now, name) for name in AFTER_RESET})
         parts.action.copy_(parts.memory.action)
+        held = parts.targets() if parts.scenarios is None else parts.scenarios.acting(parts.targets())
         self.backend.reset(
             ResetState(
                 base_position=physics["base_position_w"],
@@ -358,11 +378,13 @@ class TrainingEnvironment(VecEnv):
                 base_linear_velocity=physics["base_linear_velocity_w"],
                 base_angular_velocity=physics["base_angular_velocity_b"],
                 joint_velocity=physics["joint_velocity"],
-                held_target=parts.targets(),
+                held_target=held,
                 terrain_index=parts.memory.terrain_index,
             )
         )
         self._read(AFTER_RESET)
+        if parts.scenarios is not None:
+            parts.scenarios.prepare(self._inputs, parts.memory.episode_length)
 
     def _begin_from(self, progress: dict[str, Any]) -> None:
         """Begin new episodes where ``progress_dict`` says that the run is."""

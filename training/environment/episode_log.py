@@ -10,6 +10,7 @@ from .curriculum import TrainingPalette
 from .memory import EnvironmentMemory
 from .step_inputs import StepInputs
 from .terminations import Ends
+from .terrain_configuration import SCENARIOS
 
 METRICS = ("linear_velocity_error", "yaw_rate_error")
 """Averages over all worlds and steps, in the order of ``EnvironmentMemory.metric_sums``."""
@@ -28,13 +29,14 @@ class EpisodeLog:
         control_period: float,
     ) -> None:
         """Name the columns by reward terms and rules that end episodes; ``kind`` is the kind of tile of every world, (N,) int64, and the
-        period in seconds.
+        period in seconds. Worlds of scenarios, the last ones, have no level.
         """
         self._names = [f"Episode_Reward/{name}" for name in rewards]
         self._names += [f"Episode_Termination/{name}" for name in terminations]
         self._names += [f"Metrics/{name}" for name in METRICS]
-        self._kinds = [f"Curriculum/{tile.name}" for tile in palette.tiles]
-        of_kind = (kind[None, :] == torch.arange(len(palette.tiles), device=kind.device)[:, None]).float()
+        self._kinds = [f"Curriculum/{tile.name}" for tile in palette.tiles if tile.name != SCENARIOS]
+        of_kind = (kind[None, :] == torch.arange(len(self._kinds), device=kind.device)[:, None]).float()
+        self._levelled = int((kind < len(self._kinds)).sum())
         self._kind_share = of_kind / of_kind.sum(dim=1, keepdim=True).clamp_min(1.0)
         self._one = torch.ones(len(kind), 1, device=kind.device)
         self._period = control_period
@@ -67,7 +69,7 @@ class EpisodeLog:
         log = dict(zip(self._names, memory.last_log.clone().unbind(), strict=True))
         level = memory.level.float()
         log |= dict(zip(self._kinds, (self._kind_share * level).sum(dim=1).unbind(), strict=True))
-        log["Curriculum/mean_level"] = level.mean()
+        log["Curriculum/mean_level"] = level[: self._levelled].mean()
         log["Curriculum/progress"] = progress
         log["Physics/nan_resets"] = memory.diverged_total.float()
         return log

@@ -18,6 +18,7 @@ from ...terrains.height_scan import HeightRasters, place_pattern, scan_pattern
 from .configuration import PushConfiguration, RandomizationConfiguration, ResetConfiguration
 from .memory import EnvironmentMemory
 from .randomness import UniformColumns
+from .scenarios import ScenarioWorlds
 from .terrain_configuration import TerrainConfiguration
 
 
@@ -56,8 +57,9 @@ class EpisodeStarts:
         robot: Robot,
         rasters: HeightRasters,
         device: torch.device | str,
+        scenarios: ScenarioWorlds | None = None,
     ) -> None:
-        self._reset, self._terrain, self._rasters = reset, terrain, rasters
+        self._reset, self._terrain, self._rasters, self._scenarios = reset, terrain, rasters, scenarios
         self._footprint = scan_pattern(*reset.footprint, 0.1, device)
         self._clearance = robot.stand_height if reset.clearance is None else reset.clearance
         self._default_pose = torch.tensor(robot.default_joint_position, device=device)
@@ -74,11 +76,16 @@ class EpisodeStarts:
         torch.where(worlds, ~spread, memory.moves_level, out=memory.moves_level)
         xy = uniform.signed("place") * torch.where(spread, self._spread, self._jitter)[:, None]
         yaw = uniform.between("yaw", -math.pi, math.pi)[:, 0]
+        if self._scenarios is not None:
+            self._scenarios.place(xy, yaw, uniform.signed("scenario_start"))
+            memory.moves_level[self._scenarios.first :] = False
         direction = torch.stack((torch.cos(yaw), torch.sin(yaw)), dim=1)
         footprint = place_pattern(self._footprint, xy, direction)
         ground = self._rasters.height(memory.terrain_index, footprint).amax(dim=1)
         joints = self._default_pose * uniform.between("joints", *self._reset.joint_scale)
         twist = uniform.signed("twist") * self._reset.velocity
+        if self._scenarios is not None:
+            self._scenarios.rest(joints, twist)
         state = ResetState(
             base_position=torch.cat((xy, ground[:, None] + self._clearance), dim=1),
             base_quaternion=from_yaw(yaw),

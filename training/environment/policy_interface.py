@@ -59,6 +59,12 @@ def joint_parameters(robot: Robot, configuration: EnvironmentConfiguration) -> J
     return replace(found, **changed)
 
 
+def largest_told(configuration: EnvironmentConfiguration) -> tuple[float, float, float]:
+    """Return the largest forward, lateral [m/s] and yaw [rad/s] command of a training."""
+    tiles = [tile.command_limits for tile in configuration.terrain.tiles if tile.share > 0]
+    return largest_commands(configuration.commands, tiles)
+
+
 def training_contract(
     robot: Robot, parameters: JointParameters, configuration: EnvironmentConfiguration
 ) -> PolicyContract:
@@ -68,7 +74,6 @@ def training_contract(
     Raises:
         ConfigurationError: an observation of one's own is not there, or breaks a rule.
     """
-    tiles = [tile for tile in configuration.terrain.tiles if tile.share > 0]
     provenance = {REMEMBERED: identify(robot, configuration.robot)}
     standard = standard_contract(
         robot, history=History(start=configuration.observations.history_start), provenance=provenance
@@ -89,7 +94,7 @@ def training_contract(
     return replace(
         standard,
         observation=standard.observation + clock + more,
-        command_limits=largest_commands(configuration.commands, [tile.command_limits for tile in tiles]),
+        command_limits=largest_told(configuration),
         stiffness=tuple(parameters.stiffness[i] for i in driven),
         damping=tuple(parameters.damping[i] for i in driven),
         control_period=configuration.physics.control_period,

@@ -9,6 +9,7 @@ randomizes and pushes the physics.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -18,6 +19,7 @@ from ...policy.contract import PolicyContract
 from ...policy.ground import Ground
 from ...policy.observation import ObservationBuilder
 from ...robots.base import JointParameters, Robot
+from ...studies.trials.scenario import Scenario
 from ...terrains.height_scan import HeightRasters, scan_pattern
 from .commands import COMMAND_COLUMNS, CommandGenerator
 from .configuration import EnvironmentConfiguration
@@ -30,6 +32,7 @@ from .observations import Observations, Observer
 from .own_terms import resolve_class
 from .randomness import UniformColumns
 from .rewards import RewardFunction
+from .scenarios import ScenarioWorlds
 from .step_reader import StepReader
 from .terminations import Terminations
 
@@ -64,6 +67,7 @@ class EnvironmentStep:
         kind: torch.Tensor,
         inputs: PhysicsState,
         generator: torch.Generator,
+        scenarios: Sequence[Scenario] = (),
     ) -> None:
         """Allocate everything.
 
@@ -72,6 +76,7 @@ class EnvironmentStep:
             kind: kind of tile of every world, (N,) int64.
             inputs: tensors that the physics state is copied into before each part.
             generator: where uniform numbers come from.
+            scenarios: those that the worlds of the palette's last kind play.
 
         Raises:
             ConfigurationError: a setting that makes no sense, or a term of one's own that is not there.
@@ -86,6 +91,18 @@ class EnvironmentStep:
         reach = math.hypot(seen.scan_length, seen.scan_width) / 2
         edge = terrain.leave_distance or terrain.promotion_distance
         rasters = HeightRasters(palette.terrains, half_size=edge + reach, cell=seen.scan_cell, device=device)
+        longest = torch.full((num_envs,), self.max_episode_length, device=device)
+        self.scenarios = None
+        if scenarios:
+            self.scenarios = ScenarioWorlds(
+                scenarios,
+                configuration,
+                robot=robot,
+                num_worlds=int((kind == len(palette.tiles) - 1).sum()),
+                terrains=len(palette.terrains),
+                device=device,
+            )
+            longest[self.scenarios.first :] = self.scenarios.steps
 
         self.read = StepReader(
             configuration,
@@ -95,6 +112,7 @@ class EnvironmentStep:
             kind=kind,
             scan=self.scan,
             rasters=rasters,
+            longest=longest if scenarios else self.max_episode_length,
         )
         self.rewards = RewardFunction(configuration.rewards, period, kind, palette.tiles)
         self.terminations = Terminations(configuration.termination)
@@ -111,7 +129,9 @@ class EnvironmentStep:
         self.motors = MotorParameters(
             configuration.randomization, num_envs, joints, device, offset=parameters.target_offset
         )
-        self.starts = EpisodeStarts(configuration.reset, terrain, robot=robot, rasters=rasters, device=device)
+        self.starts = EpisodeStarts(
+            configuration.reset, terrain, robot=robot, rasters=rasters, device=device, scenarios=self.scenarios
+        )
         self.pushes = Pushes(configuration.push, num_envs, control_period=period, device=device)
         self.log = EpisodeLog(
             rewards=self.rewards.names,
@@ -151,6 +171,7 @@ class EnvironmentStep:
                 **{"twist": 6, "push": 5, "level": 1, "variant": 1},
                 **dict.fromkeys(MOTOR_COLUMNS, joints),
                 **COMMAND_COLUMNS,
+                **({"scenario": self.scenarios.columns, "scenario_start": 3} if self.scenarios else {}),
             },
             num_envs,
             generator,
@@ -183,6 +204,10 @@ class EnvironmentStep:
         memory.remember(inputs)
         self.levels.follow(memory, inputs)
         push = self.pushes(done, self.inputs, memory, self.uniform)
+        if self.scenarios is not None:
+            self.scenarios.count_ends(done, ends.failed)
+            if push is not None:
+                push.worlds[self.scenarios.first :] = False  # they have pushes of their own
         # A diverged world is the engine's failure: it moves no level, wherever it was flung.
         memory.moves_level.logical_and_(~inputs.diverged)
         start = self.begin_episodes(done, ends.failed, progress, inputs.heading_xy)
@@ -197,6 +222,8 @@ class EnvironmentStep:
         memory, uniform = self.memory, self.uniform
         self.levels.move(memory, uniform, worlds, failed)
         memory.begin_episode(worlds)
+        if self.scenarios is not None:
+            self.scenarios.begin(worlds, memory.terrain_index, uniform["scenario"])
         due = self._new_commands(worlds, progress)
         self.motors.redraw(uniform.span(MOTOR_COLUMNS[0], MOTOR_COLUMNS[-1]), worlds)
         start = self.starts(worlds, memory, uniform)
@@ -232,8 +259,12 @@ class EnvironmentStep:
         torch.where(due, drawn.extreme, memory.command_extreme, out=memory.command_extreme)
         torch.where(due, drawn.holds_heading, memory.holds_heading, out=memory.holds_heading)
         memory.issued.add_(drawn.command[:, :2] * due[:, None])
+        if self.scenarios is not None:
+            self.scenarios.tell(memory.command, due, memory.holds_heading, memory.episode_length)
         return due
 
     def observe(self) -> Observations:
         """Return observations of the present state, which is fresh for worlds that were just reset or pushed."""
+        if self.scenarios is not None:
+            self.scenarios.prepare(self.inputs, self.memory.episode_length)
         return self.observer(self.inputs, self.memory, self.uniform)

@@ -120,8 +120,8 @@ class StepInputs:
     """``distance`` at which an episode is cut short [m], infinite for never, (N,)."""
     episode_length: torch.Tensor
     """Control steps of the present episode, (N,) int64."""
-    max_episode_length: int
-    """Control steps of the longest episode."""
+    max_episode_length: int | torch.Tensor
+    """Control steps of the longest episode; (N,) where some worlds play scenarios."""
     can_be_stuck: torch.Tensor
     """Worlds on tiles on which being stuck ends an episode, (N,) bool."""
     shortfall: torch.Tensor

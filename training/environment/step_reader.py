@@ -35,15 +35,19 @@ class StepReader:
         kind: torch.Tensor,
         scan: torch.Tensor,
         rasters: HeightRasters,
+        longest: int | torch.Tensor,
     ) -> None:
         """Prepare constants; ``kind`` is the kind of tile of every world, (N,) int64, ``scan`` the points of the height scan about the base
-        [m], (P, 2). Raises ConfigurationError: no point of the scan is below the trunk, or joint speeds of motors with an unknown no-load
-        speed are judged.
+        [m], (P, 2), ``longest`` the control steps of the longest episode, one number or (N,).
+
+        Raises:
+            ConfigurationError: no point of the scan is below the trunk, or joint speeds of motors with an unknown no-load
+                speed are judged.
         """
         self._settings, self._rasters = configuration.rewards, rasters
         self._joint_velocity_limit = configuration.termination.joint_velocity
         self._period = configuration.physics.control_period
-        self._longest = round(configuration.episode_length / self._period)
+        self._longest = longest
         self._device = device = kind.device
         area = 0.5 * torch.tensor(self._settings.trunk_area, device=device) + 1e-4
         self._trunk_points = scan[(scan.abs() <= area).all(dim=1)]

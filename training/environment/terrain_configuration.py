@@ -14,6 +14,10 @@ _Distance = Annotated[float, Field(gt=0.0, le=100.0)]
 _Spread = Annotated[float, Field(ge=0.0, le=100.0)]
 
 
+SCENARIOS = "scenarios"
+"""Kind of ground of the worlds that play ``EnvironmentConfiguration.scenarios``, which has no level."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class TileConfiguration:
     """One kind of training tile: its share, the commands on it, and factors on the settings of the same names in ``rewards`` and
