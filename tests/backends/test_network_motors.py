@@ -15,6 +15,7 @@ from gaitgauge.terrains.registry import make_terrain
 
 GO2 = load_robot("go2", check=False)
 KP, KD = 20.0, 0.5
+CUDA = [pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")]
 
 
 def law_network(**changes):
@@ -49,7 +50,8 @@ def test_feed_forward_network_by_hand():
     assert state.call(one(0.0), one(0.0), every).item() == pytest.approx(1.5)
 
 
-def test_lstm_is_torchs():
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=CUDA)])
+def test_lstm_is_torchs(device):
     torch.manual_seed(0)
     lstm, last = torch.nn.LSTM(2, 8, num_layers=2, batch_first=True), torch.nn.Linear(8, 1)
     arrays = {"weight_0": last.weight.detach().numpy(), "bias_0": last.bias.detach().numpy()}
@@ -58,46 +60,48 @@ def test_lstm_is_torchs():
         arrays[f"lstm_{i}_hidden"] = getattr(lstm, f"weight_hh_l{i}").detach().numpy()
         arrays[f"lstm_{i}_bias"] = (getattr(lstm, f"bias_ih_l{i}") + getattr(lstm, f"bias_hh_l{i}")).detach().numpy()
     network = MotorNetwork(kind="lstm", error_scale=2.0, velocity_scale=0.25, torque_scale=20.0, arrays=arrays)
-    state = NetworkState(network, 3, 4, torch.device("cpu"))
-    every = torch.ones(3, dtype=torch.bool)
+    place = torch.device(device)
+    state = NetworkState(network, 3, 4, place)
+    every = torch.ones(3, dtype=torch.bool, device=place)
     memory = None
     for _ in range(4):
         error, velocity = torch.randn(3, 4), torch.randn(3, 4)
         inputs = torch.stack((2.0 * error, 0.25 * velocity), dim=-1).view(12, 1, 2)
         output, memory = lstm(inputs, memory)
-        torch.testing.assert_close(state.call(error, velocity, every), 20.0 * last(output).view(3, 4))
-    state.reset(torch.tensor([True, False, False]))
-    fresh = NetworkState(network, 3, 4, torch.device("cpu"))
-    error, velocity = torch.randn(3, 4), torch.randn(3, 4)
+        found = state.call(error.to(place), velocity.to(place), every).cpu()
+        torch.testing.assert_close(found, 20.0 * last(output).view(3, 4), atol=2e-5, rtol=1e-5)
+    state.reset(torch.tensor([True, False, False], device=place))
+    fresh = NetworkState(network, 3, 4, place)
+    error, velocity = torch.randn(3, 4, device=place), torch.randn(3, 4, device=place)
     after = state.call(error, velocity, every)
     torch.testing.assert_close(after[0], fresh.call(error, velocity, every)[0])
     assert (after[1] - fresh.call(error, velocity, every)[1]).abs().max() > 1e-3
 
 
 ENGINES = [
-    "mujoco",
-    pytest.param("mujoco-warp", marks=pytest.mark.slow),
-    pytest.param("newton", marks=pytest.mark.slow),
+    ("mujoco", "cpu"),
+    pytest.param("mujoco-warp", "cpu", marks=pytest.mark.slow),
+    pytest.param("newton", "cpu", marks=pytest.mark.slow),
+    pytest.param("mujoco-warp", "cuda", marks=CUDA),
+    pytest.param("newton", "cuda", marks=CUDA),
 ]
 
 
-@pytest.mark.parametrize("engine", ENGINES)
-def test_a_network_that_is_the_law_moves_as_the_law(engine, tmp_path):
+@pytest.mark.parametrize(("engine", "device"), ENGINES)
+def test_a_network_that_is_the_law_moves_as_the_law(engine, device, tmp_path):
     """At steps of 5 ms the torque of a call acts for one step, as the law's does."""
-    network = make_backend(engine, scene_of(tmp_path, law_network()))
-    law = make_backend(engine, scene_of(tmp_path))
-    targets = torch.tensor([GO2.default_joint_position] * 2, dtype=law.dtype) + torch.tensor(
-        [[0.2], [-0.1]], dtype=law.dtype
-    )
-    delay = torch.tensor([0, 2])
-    strength = torch.full((2, 12), 0.9, dtype=law.dtype)
-    offset = torch.full((2, 12), 0.03, dtype=law.dtype)
+    network = make_backend(engine, scene_of(tmp_path, law_network()), device=device)
+    law = make_backend(engine, scene_of(tmp_path), device=device)
+    number, place = {"dtype": law.dtype, "device": law.device}, {"device": law.device}
+    targets = torch.tensor([GO2.default_joint_position] * 2, **number) + torch.tensor([[0.2], [-0.1]], **number)
+    delay, sample_at = torch.tensor([0, 2], **place), torch.tensor([3, 0], **place)
+    strength, offset = torch.full((2, 12), 0.9, **number), torch.full((2, 12), 0.03, **number)
     for backend in (network, law):
         backend.randomize(Randomization(motor_strength=strength, motor_offset=offset))
         backend.reset(replace(backend.standing(), held_target=None))
         backend.step(None, substeps=1)
         for turn in range(5):
-            backend.step(targets + 0.02 * turn, delay=delay, sample_at=torch.tensor([3, 0]))
+            backend.step(targets + 0.02 * turn, delay=delay, sample_at=sample_at)
     tolerance = 1e-6 if engine == "mujoco" else 2e-3  # the network computes in float32
     for name in ("joint_position", "base_position_w", "joint_torque"):
         own, theirs = getattr(network.state, name), getattr(law.state, name)
