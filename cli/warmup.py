@@ -9,7 +9,7 @@ from pathlib import Path
 
 import torch
 
-from ..backends.base import TRAINING_PHYSICS, Scene
+from ..backends.base import PhysicsOptions, Scene
 from ..files.choices import cpu_threads
 from ..gauge.suite import load_suite
 from ..robots import Robot, load_robot
@@ -73,6 +73,15 @@ def run_warmup(
         console.say("what an engine launches on a GPU alone is not seen from a CPU and is compiled at the first use")
 
 
+def _training_physics() -> list[PhysicsOptions]:
+    """Return the physics of every stretch of a training on all terrains."""
+    from ..training.environment.stretches import settings_in
+    from ..training.tasks import TASKS
+
+    environment = TASKS["go2-moe-cts"].environment
+    return [settings_in(environment, n).physics for n in range(len(environment.schedule.stretches) + 1)]
+
+
 def scenes_of(robot: Robot) -> list[Scene]:
     """Return a few worlds of training and of the gauge, on level ground, on boxes and on a height field."""
     level = LEVELS[len(LEVELS) // 2]
@@ -82,10 +91,10 @@ def scenes_of(robot: Robot) -> list[Scene]:
     return [
         Scene(
             robot=robot,
-            parameters=robot.parameters.get("training", own) if each is TRAINING_PHYSICS else own,
+            parameters=robot.parameters.get("training", own) if each in _training_physics() else own,
             terrains=terrains,
             terrain_index=tuple(range(len(terrains))),
             physics=each,
         )
-        for each in (TRAINING_PHYSICS, load_suite(_SUITE).physics)
+        for each in dict.fromkeys((*_training_physics(), load_suite(_SUITE).physics))
     ]

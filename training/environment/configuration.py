@@ -31,6 +31,20 @@ _STATIONARY = Ramp(start=0.0, end=0.1, begin=0.0, until=0.05)
 
 
 @dataclass(frozen=True, kw_only=True)
+class Stretch:
+    """Settings of the environment that change at a fraction of the run. The physics is built anew there, and episodes begin anew on the
+    levels reached; a setting that is also given on the command line holds throughout.
+    """
+
+    name: str
+    """Name in messages and settings."""
+    begin: Share
+    """Fraction of the run at which the stretch begins; 1 for never."""
+    settings: str
+    """``environment.…=value``, separated by spaces."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class ScheduleConfiguration:
     """Number of steps of a whole run, and the fraction of it at which the run begins."""
 
@@ -40,6 +54,8 @@ class ScheduleConfiguration:
     begin: Share = 0.0
     """Fraction of the run that counts as done at its start: a run that begins with trained networks need not begin with the commands of a
     robot that cannot walk yet."""
+    stretches: tuple[Stretch, ...] = ()
+    """Later parts of the run with other settings, in order."""
 
 
 @dataclass(frozen=True, kw_only=True)

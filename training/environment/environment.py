@@ -7,6 +7,7 @@ the state after that, so that the first observation of an episode is fresh. Noth
 
 from __future__ import annotations
 
+import gc
 import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -27,7 +28,7 @@ from ...robots.registry import load_robot
 from ...robots.welding import welded
 from ...terrains.height_scan import heading
 from ..configuration import ConfigurationError
-from .configuration import EnvironmentConfiguration
+from .configuration import EnvironmentConfiguration, Stretch
 from .curriculum import assign_kinds, build_palette
 from .domain_randomization import draw_bodies
 from .events import EpisodeStart
@@ -38,10 +39,13 @@ from .policy_interface import driven_robot, joint_parameters, training_contract
 from .scenarios import read_scenarios, with_scenarios
 from .step import EnvironmentStep, StepResult
 from .step_inputs import AFTER_RESET, AFTER_STEP, static_inputs
+from .stretches import check_stretches, settings_in, stretch_at
 
 _log = logging.getLogger(__name__)
 
 STATE_VERSION = 1
+_SEED_STRIDE = 1_000_003
+"""Distance of the seeds of a run's stretches: those of its processes are neighbours."""
 
 
 class TrainingEnvironment(VecEnv):
@@ -51,6 +55,7 @@ class TrainingEnvironment(VecEnv):
         contract: the interface of the policies trained here, one frame of observation.
         backend: the physics.
         common_step_counter: environment steps taken in the run.
+        stretch: number of stretches of the schedule that have begun; ``configuration`` holds the settings of the present one.
         unfused: why the torch parts are not compiled though they should have been, a sentence; empty otherwise.
     """
 
@@ -63,6 +68,7 @@ class TrainingEnvironment(VecEnv):
         threads: int = 1,
         capture: bool = False,
         fuse: bool | None = None,
+        progress: float | None = None,
     ) -> None:
         """Build the worlds and begin their first episodes.
 
@@ -73,6 +79,8 @@ class TrainingEnvironment(VecEnv):
             capture: replay the torch parts of a step as CUDA graphs; needs a CUDA device.
             fuse: compile the torch parts with ``torch.compile``, which merges their several hundred small kernels into a few; numbers
                 differ in the last digits. None: on a GPU, unless a function of one's own cannot be compiled, which ``unfused`` then says.
+            progress: fraction of the run that a state which is loaded next has reached, None for the beginning: the environment is then
+                built once, with the settings of that stretch.
 
         Raises:
             ConfigurationError: a setting that makes no sense, such as ``capture`` without a CUDA device, or ``fuse`` for a function that
@@ -87,18 +95,32 @@ class TrainingEnvironment(VecEnv):
             raise ConfigurationError(
                 f"environment.num_envs is {configuration.num_envs}; an environment needs at least 1 world"
             )
-        slow, fast = configuration.randomization.motor_speed
-        if (slow, fast) != (1.0, 1.0) and not configuration.physics.torque_speed_limit:
+        schedule = configuration.schedule
+        if not 0.0 <= schedule.begin <= 1.0:
             raise ConfigurationError(
-                f"environment.randomization.motor_speed is {slow:g} to {fast:g} while environment.physics.torque_speed_limit is "
-                "off, without which it does nothing; turn the limit on, or leave motor_speed at 1,1"
+                f"environment.schedule.begin is {schedule.begin:g}; it is a fraction of the run, 0 to 1"
             )
-        self.cfg = self.configuration = configuration
         whole = driven_robot(load_robot(configuration.robot), configuration)
         self.contract = training_contract(whole, joint_parameters(whole, configuration), configuration)
+        check_stretches(configuration, whole, self.contract)
         self._model_folder = TemporaryDirectory(prefix="gaitgauge-robot-") if configuration.joints.rigid else None
         self.robot = whole if self._model_folder is None else welded(whole, Path(self._model_folder.name))
-        parameters = joint_parameters(self.robot, configuration)
+        self._parameters = joint_parameters(self.robot, configuration)
+        self.num_envs = configuration.num_envs
+        self.num_actions = self.contract.num_joints
+        self.common_step_counter = 0
+        self._given, self._engine = configuration, (backend, device, threads)
+        self._captures, self._fuses = capture, fuse
+        self._first_step = round(schedule.begin * schedule.horizon_steps)
+        reached = self._first_step if progress is None else round(progress * schedule.horizon_steps)
+        self._build(stretch_at(schedule, reached))
+
+    def _build(self, stretch: int) -> None:
+        """Build the worlds with the settings of a stretch and begin their first episodes."""
+        configuration, (backend, device, threads) = settings_in(self._given, stretch), self._engine
+        self.cfg = self.configuration = configuration
+        self.stretch = stretch
+        parameters = self._parameters
         self.palette = build_palette(configuration.terrain)
         scenarios = read_scenarios(configuration)
         if scenarios:
@@ -114,10 +136,8 @@ class TrainingEnvironment(VecEnv):
         )
         self.backend = make_backend(backend, scene, device=device, threads=threads)
         self.device = self.backend.device
-        self.num_envs = configuration.num_envs
-        self.num_actions = self.contract.num_joints
         self._generator = torch.Generator(device=self.device)
-        self._generator.manual_seed(configuration.seed)
+        self._generator.manual_seed(configuration.seed + _SEED_STRIDE * stretch)
         state = self.backend.state
         self._inputs = state if self.backend.state_stays else static_inputs(state)
         self.parts = EnvironmentStep(
@@ -133,7 +153,6 @@ class TrainingEnvironment(VecEnv):
         )
         self.max_episode_length = self.parts.max_episode_length
         self.kind = self.parts.kind
-        self.common_step_counter = 0
         self._events = resolve_own(configuration.events, "environment.events").values()
         self._bodies = draw_bodies(
             configuration.randomization, self.num_envs, len(self.robot.collision_bodies), self._generator
@@ -141,20 +160,26 @@ class TrainingEnvironment(VecEnv):
         if self.parts.scenarios is not None:
             self.parts.scenarios.load(self._bodies, self._generator)
         self.backend.randomize(Randomization(**self._bodies))
-        schedule = configuration.schedule
-        if not 0.0 <= schedule.begin <= 1.0:
-            raise ConfigurationError(
-                f"environment.schedule.begin is {schedule.begin:g}; it is a fraction of the run, 0 to 1"
-            )
-        self.parts.memory.step.fill_(round(schedule.begin * schedule.horizon_steps))
+        self.parts.memory.step.fill_(self._first_step)
         self._begin(level.to(self.device))
         self._after_physics: Callable[[], StepResult] = self.parts.after_physics
         self._observe: Callable[[], Observations] = self.parts.observe
         self.unfused = ""
-        if fuse or (fuse is None and self.device.type == "cuda"):
-            self._fuse(required=fuse is not None)
-        if capture:
+        if self._fuses or (self._fuses is None and self.device.type == "cuda"):
+            self._fuse(required=self._fuses is not None)
+        if self._captures:
             self._capture()
+
+    def _rebuild(self, stretch: int) -> None:
+        """Free the worlds and build those of another stretch."""
+        self.backend.close()
+        # Two environments at once may not fit into the device's memory; recorded and compiled functions hold on to their tensors.
+        del self.backend, self.parts, self.palette, self.kind, self._inputs, self._bodies, self._events
+        del self._after_physics, self._observe, self._observations
+        gc.collect()
+        if self.device.type == "cuda":
+            torch.cuda.empty_cache()
+        self._build(stretch)
 
     @property
     def progress(self) -> torch.Tensor:
@@ -299,6 +324,28 @@ class TrainingEnvironment(VecEnv):
             log |= self.parts.scenarios.log()
         return log | {"Physics/overflow_worlds": self.backend.state.overflowed.sum().float()}
 
+    # --- stretches --------------------------------------------------------------------------------------------------
+
+    @property
+    def stretch_ends(self) -> bool:
+        """Return True where the next stretch of the schedule is due: ``next_stretch`` begins it."""
+        return stretch_at(self._given.schedule, self._first_step + self.common_step_counter) > self.stretch
+
+    def next_stretch(self) -> Stretch:
+        """Build the worlds of the stretch that is due, with new bodies, begin their episodes on the levels reached, and return it."""
+        self._enter(self.progress_dict())
+        return self._given.schedule.stretches[self.stretch - 1]
+
+    def _enter(self, state: dict[str, Any]) -> bool:
+        """Build the stretch that a saved state has reached; returns True if it begins there, which its episodes then have done."""
+        reached = {**state, **{k: v for k, v in state.get("memory", {}).items() if k in ("step", "level")}}
+        stretch = stretch_at(self._given.schedule, int(reached["step"]))
+        if stretch != self.stretch:
+            self._rebuild(stretch)
+        if begins := state.get("stretch", 0) != stretch:
+            self._begin_from({**reached, "bodies": self._bodies})
+        return begins
+
     # --- resuming ---------------------------------------------------------------------------------------------------
 
     def progress_dict(self) -> dict[str, Any]:
@@ -307,6 +354,7 @@ class TrainingEnvironment(VecEnv):
         """
         return {
             "version": STATE_VERSION,
+            "stretch": self.stretch,
             "step": self.parts.memory.step.clone(),
             "level": self.parts.memory.level.to(torch.int16),
             "bodies": copied(self._bodies),
@@ -323,6 +371,7 @@ class TrainingEnvironment(VecEnv):
         state = self.backend.state
         return {
             "version": STATE_VERSION,
+            "stretch": self.stretch,
             "memory": copied(self.parts.memory.by_name()),
             "motors": copied(self.parts.motors.by_name()),
             "scenarios": {} if self.parts.scenarios is None else copied(self.parts.scenarios.by_name()),
@@ -344,6 +393,8 @@ class TrainingEnvironment(VecEnv):
             raise ValueError(
                 f"the saved environment has version {state.get('version')}, this program reads {STATE_VERSION}"
             )
+        if self._given.schedule.stretches and self._enter(state):
+            return
         if "memory" not in state:
             self._begin_from(state)
             return

@@ -22,6 +22,7 @@ from ...policy.contract import PHYSICS, PolicyContract
 from ...policy.finding import shipped_policies
 from ..algorithms.symmetry import build_mirror
 from ..configuration import ConfigurationError
+from ..environment.configuration import EnvironmentConfiguration
 from ..environment.environment import TrainingEnvironment
 from ..processes import Processes, ProcessLostError
 from .checkpoint import CheckpointError
@@ -123,6 +124,7 @@ def _environment(plan: TrainPlan, closing: ExitStack) -> TrainingEnvironment:
         threads=cpu_threads(request.threads),
         capture=plan.device.startswith("cuda") if request.capture is None else request.capture,
         fuse=request.fuse,
+        progress=plan.progress,
     )
     closing.callback(env.close)
     return env
@@ -150,9 +152,11 @@ def _runner(
             every=task.training.run.video_interval > 0,
             last=request.film,
         )
-    contract = replace(
-        env.contract, provenance={**env.contract.provenance, PHYSICS: _physics(plan, scored=scorer is not None)}
-    )
+
+    def physics(environment: EnvironmentConfiguration) -> dict[str, Any]:
+        return _physics(plan, environment, scored=scorer is not None)
+
+    contract = replace(env.contract, provenance={**env.contract.provenance, PHYSICS: physics(env.configuration)})
     mirror = None
     if task.training.algorithm.symmetry != "none":
         mirror = build_mirror(task.environment.observations, contract=env.contract, robot=env.robot)
@@ -169,6 +173,7 @@ def _runner(
         filmer=filmer,
         settings=plan.settings,
         progress=progress,
+        physics=physics,
         message=message,
     )
 
@@ -179,9 +184,9 @@ def _straight(contract: PolicyContract) -> tuple[float, float, float] | None:
     return None if lateral or yaw else (0.75 * forward, 0.0, 0.0)
 
 
-def _physics(plan: TrainPlan, *, scored: bool) -> dict[str, Any]:
+def _physics(plan: TrainPlan, environment: EnvironmentConfiguration, *, scored: bool) -> dict[str, Any]:
     """Return the physics of a run for the provenance of its policies: the engine that trains them, and the one that scores them."""
-    environment, known = plan.task.environment, versions()
+    known = versions()
     physics, engine = environment.physics, find_backend(plan.backend, plan.device)
     settings = {name: getattr(physics, name) for name in ("timestep", "substeps", "foot_condim", "self_collision")}
     low, high = environment.randomization.foot_torsion

@@ -104,6 +104,11 @@ class RunLogger:
         self._entries: list[tuple[tuple[str, ...], torch.Tensor]] = []
         self._latest = 0
 
+    def forget_episodes(self) -> None:
+        """Drop the running episodes: the environment has begun new ones."""
+        self.reward_sum.zero_()
+        self.episode_length.zero_()
+
     def add_step(self, rewards: torch.Tensor, dones: torch.Tensor, extras: Mapping[str, Any]) -> None:
         """Note one step of all environments, in environment order; ``extras["log"]`` has scalars by name."""
         self.reward_sum += rewards

@@ -54,6 +54,8 @@ class TrainPlan:
     """Backend and resolved configuration, kept in every checkpoint: a later resume builds the same run from them."""
     checkpoint: Path | None = None
     """Checkpoint that the run continues; None for a new run."""
+    progress: float | None = None
+    """Fraction of the run that the checkpoint has reached; None for a new run."""
     run: Path | None = None
     """Run directory that the run continues; None to make a new one."""
     weights: Path | None = None
@@ -129,7 +131,8 @@ def resumed_run(request: TrainRequest, choice: str) -> TrainPlan:
             f"the run has done {iteration} of {wanted} iterations; to go on, give a larger --iterations"
         )
     plan = _checked_plan(request, task, request.backend or backend)
-    return replace(plan, checkpoint=checkpoint, run=run, notice="; ".join(filter(None, (branched, moved))))
+    notice = "; ".join(filter(None, (branched, moved)))
+    return replace(plan, checkpoint=checkpoint, progress=reached(entries), run=run, notice=notice)
 
 
 def _checked_plan(request: TrainRequest, task: Task, backend: str) -> TrainPlan:

@@ -118,7 +118,7 @@ def resume_run(run: RunState, path: Path) -> None:
     _check_fits(run, path, entries, numbers)
     with edited(f"Cannot resume from '{path}': its training state", CheckpointError, RuntimeError):
         whole = _take_over(run, path, entries, numbers)
-        _remember_physics(run, PolicyContract.from_json(entries["contract"]))
+        remember_physics(run, PolicyContract.from_json(entries["contract"]))
     if numbers.world_size == run.processes.count and (
         lacking := run.processes.largest(0 if whole else run.processes.rank)
     ):
@@ -204,10 +204,10 @@ def _begin(run: RunState, path: Path, entries: Mapping[str, Any]) -> None:
     except (RuntimeError, KeyError, ValueError) as error:
         raise _misfit("start", path, error) from error
     run.average.load_state_dict(None)
-    _remember_physics(run, theirs)
+    remember_physics(run, theirs)
 
 
-def _remember_physics(run: RunState, theirs: PolicyContract) -> None:
+def remember_physics(run: RunState, theirs: PolicyContract) -> None:
     """Note the physics of the policy that a run begins or goes on with before the run's own, in the provenance of its policies."""
     own, earlier = (contract.provenance.get(PHYSICS) for contract in (run.contract, theirs))
     if not isinstance(own, Mapping):
@@ -245,8 +245,12 @@ def _load_environment(run: RunState, path: Path, state: Any) -> bool:
 
 
 def _runs_on(run: RunState, local: Mapping[str, Any]) -> bool:
-    """Return True if a checkpoint holds running episodes; for an environment of another kind, the settings tell."""
+    """Return True if a checkpoint holds running episodes, which end where a stretch of the schedule begins; for an environment of another
+    kind, the settings tell.
+    """
     state = local["environment"]
+    if state.get("stretch", 0) != getattr(run.env, "stretch", 0):
+        return False
     return "memory" in state if "bodies" in state else run.configuration.run.keep_episodes
 
 

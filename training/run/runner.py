@@ -10,6 +10,7 @@ import math
 import secrets
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,15 +18,17 @@ import torch
 from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 
+from ...policy.contract import PHYSICS
 from ..configuration import TrainingConfiguration
 from ..processes import ProcessLostError
 from .beside import Scores, Videos
 from .filming import Filmer
 from .logger import make_writer
 from .rescue import Rescue
-from .resuming import TrainingDivergedError, intact_checkpoint, save_run
+from .resuming import TrainingDivergedError, intact_checkpoint, remember_physics, save_run
 from .run_directory import update_run_json
 from .scoring import Scorer
+from .seeding import random_state, restore_random_state
 from .state import RunState
 from .stopping import Progress, StopSignals, TrainingOutcome
 
@@ -41,6 +44,7 @@ class TrainingRunner(RunState):
         scorer: Scorer | None = None,
         filmer: Filmer | None = None,
         progress: Callable[[Progress], None] | None = None,
+        physics: Callable[[Any], Mapping[str, Any]] | None = None,
         **parts: Any,
     ) -> None:
         """Build the run.
@@ -49,6 +53,7 @@ class TrainingRunner(RunState):
             scorer: gauges the student every ``run.gauge_interval`` iterations.
             filmer: makes videos every ``run.video_interval`` iterations, and at the end.
             progress: called after every iteration.
+            physics: describes an environment's settings for the provenance of the policies, where a stretch changes them.
             parts: arguments of ``RunState``.
 
         Raises:
@@ -57,6 +62,7 @@ class TrainingRunner(RunState):
         super().__init__(env, configuration, **parts)
         self.scores, self.videos, self.rescue = Scores(self, scorer), Videos(self, filmer), Rescue(self)
         self._progress = progress or (lambda _: None)
+        self._physics = physics
         self._nonfinite = torch.zeros((), dtype=torch.int64, device=self.device)
 
     def learn(self, iterations: int, *, max_seconds: float | None = None) -> TrainingOutcome:
@@ -83,11 +89,14 @@ class TrainingRunner(RunState):
                 while self.iteration < total:
                     obs = self._iterate(obs, lambda: signals.received is not None)
                     stop = self._agreed_stop(signals, begin, max_seconds)
-                    written = self._save_and_show(written, last=bool(stop) or self.iteration == total)
+                    ends = bool(getattr(self.env, "stretch_ends", False))
+                    written = self._save_and_show(written, last=bool(stop) or ends or self.iteration == total)
                     self._progress(self._snapshot(total, time.monotonic() - begin))
                     if stop:
                         reason = stop
                         break
+                    if ends and self.iteration < total:
+                        obs = self._next_stretch()
             except ProcessLostError as error:
                 raise self.rescue.write(error, begin) from error
             except BaseException as error:
@@ -122,11 +131,7 @@ class TrainingRunner(RunState):
     def _begin(self) -> TensorDict:
         """Bring environment, networks, log and run directory to the start of the loop; returns the first observations."""
         speaks = self.log_dir is not None and self.processes.rank == 0
-        if self.configuration.run.random_episode_start and self.fresh:
-            ages = torch.randint_like(self.env.episode_length_buf, high=int(self.env.max_episode_length))
-            self.env.episode_length_buf = ages
-        self.fresh = False
-        obs = self.env.get_observations().to(self.device)
+        obs = self._first_observations()
         self.alg.share()
         if self.processes.several:
             self.learning = self.processes.firsts(secrets.token_hex(8))
@@ -136,6 +141,33 @@ class TrainingRunner(RunState):
             update_run_json(self.log_dir, {"outcome": "running"})
         self.scores.begin()
         return obs
+
+    def _first_observations(self) -> TensorDict:
+        """Return the present observations, after new episodes were given random ages."""
+        if self.configuration.run.random_episode_start and self.fresh:
+            ages = torch.randint_like(self.env.episode_length_buf, high=int(self.env.max_episode_length))
+            self.env.episode_length_buf = ages
+        self.fresh = False
+        return self.env.get_observations().to(self.device)
+
+    def _next_stretch(self) -> TensorDict:
+        """Begin the next stretch of the environment's schedule as resuming from the checkpoint just written does; returns its first
+        observations.
+        """
+        env: Any = self.env
+        random = random_state(self.device)
+        stretch = env.next_stretch()
+        restore_random_state(random, self.device)
+        self.fresh = True
+        self.logger.forget_episodes()
+        if self._physics is not None:
+            earlier, own = self.contract, {PHYSICS: self._physics(env.configuration)}
+            self.contract = replace(earlier, provenance={**earlier.provenance, **own})
+            remember_physics(self, earlier)
+        self.message(
+            f"Stretch '{stretch.name}' begins after iteration {self.iteration}: {stretch.settings or 'nothing changes'}"
+        )
+        return self._first_observations()
 
     def _iterate(self, obs: TensorDict, stopping: Callable[[], bool]) -> TensorDict:
         """Do one rollout and one update; returns the next observations."""
