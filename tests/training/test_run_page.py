@@ -18,6 +18,11 @@ RUN = {
     "training_seconds": 90.0,
     "best_score": 0.75,
     "best_iteration": 10,
+    "settings": {
+        "environment": {
+            "schedule": {"stretches": [{"name": "end", "begin": 0.8, "settings": "environment.a=1 environment.b=2"}]}
+        }
+    },
 }
 
 
@@ -38,6 +43,7 @@ def test_without_a_score(run):
     text = written.read_text()
     assert written == run / PAGE
     assert "&lt;i&gt;mine&lt;/i&gt;" in text and "<i>mine" not in text
+    assert "Stretch end, from 80 % of the run: a=1, b=2." in text
     assert "2.50 million steps" in text and "1.5 min of learning" in text
     assert text.count("<video") == 2  # those of the last checkpoint
     assert "trunk contact" in text and "0.250" in text

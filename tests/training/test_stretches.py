@@ -1,6 +1,7 @@
 """Stretches of a run: other settings from a fraction of it on, and the same results after a stop in any of them."""
 
 from dataclasses import replace
+from unittest.mock import patch
 
 import pytest
 import torch
@@ -14,7 +15,7 @@ from gaitgauge.training.run.runner import TrainingRunner
 from gaitgauge.training.run.seeding import seed_everything
 from gaitgauge.training.tasks import find_task
 from gaitgauge_fake_engine import FakeBackend, FakeScript
-from small_environment import STAIRS, make
+from small_environment import STAIRS, idle, make
 from toy_training import toy_configuration
 
 LAST = Stretch(
@@ -25,79 +26,80 @@ LAST = Stretch(
 STEPS, TOTAL = 6, 4
 
 
-@pytest.fixture(autouse=True)
-def scripted(monkeypatch):
-    monkeypatch.setattr(
+@pytest.fixture(scope="module", autouse=True)
+def scripted():
+    with patch.object(
         environment_module, "make_backend", lambda name, scene, **_: FakeBackend(scene, script=FakeScript())
-    )
+    ):
+        yield
 
 
-def build(folder, *, seed=0, keep=True, physics=None, messages=None):
+def build(folder, *, seed=0, messages=None):
     folder.mkdir(exist_ok=True)
     seed_everything(seed)
     schedule = ScheduleConfiguration(horizon_steps=STEPS * TOTAL, stretches=(LAST,))
     environment = make(num_envs=12, terrain=STAIRS, schedule=schedule)
+    physics = {"trained": [list(environment.configuration.randomization.friction)]}
     return TrainingRunner(
         environment,
-        toy_configuration(steps=STEPS, run={"random_episode_start": True, "keep_episodes": keep}),
-        contract=environment.contract,
+        toy_configuration(steps=STEPS, run={"random_episode_start": True, "save_interval": 3}),
+        contract=replace(environment.contract, provenance={**environment.contract.provenance, "physics": physics}),
         task="toy",
         log_dir=folder,
-        physics=physics,
+        physics=lambda settings: {"trained": [list(settings.randomization.friction)]},
         message=None if messages is None else messages.append,
     )
 
 
-def test_a_run_changes_its_settings_at_the_fraction_given_and_keeps_its_levels(tmp_path):
-    messages: list[str] = []
-    run = build(
-        tmp_path / "run", physics=lambda settings: {"trained": [settings.randomization.friction]}, messages=messages
-    )
-    env = run.env
-    run.learn(2)
-    assert env.stretch == 0 and env.stretch_ends and env.configuration.rewards.tracking_sigma == 0.25
-    levels, kinds = env.parts.memory.level.clone(), env.kind.clone()
-    levels[:3] = 2
-    env.parts.memory.level.copy_(levels)
-    env.next_stretch()
-    assert env.stretch == 1 and not env.stretch_ends and env.configuration.rewards.tracking_sigma == 0.1
-    assert torch.equal(env.parts.memory.level, levels) and not torch.equal(env.kind, kinds)
-    assert float(env.progress) == 0.5 and env.common_step_counter == 2 * STEPS
-    friction = env._bodies["friction"]
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    folder, messages = tmp_path_factory.mktemp("run"), []
+    run = build(folder, messages=messages)
+    run.learn(TOTAL)
+    return folder, run, messages
+
+
+def test_a_run_changes_its_settings_at_the_fraction_given(whole):
+    folder, run, messages = whole
+    assert run.env.stretch == 1 and run.env.configuration.rewards.tracking_sigma == 0.1
+    friction = run.env._bodies["friction"]
     assert 0.5 <= float(friction.min()) <= float(friction.max()) <= 0.6
-
-
-@pytest.mark.parametrize("stop", [1, 2, 3])
-def test_a_run_that_stops_in_any_stretch_goes_on_exactly(tmp_path, stop):
-    """``stop`` 2 is the boundary: the checkpoint is of the first stretch, and what comes is of the second."""
-    messages: list[str] = []
-    build(tmp_path / "whole", messages=messages).learn(TOTAL)
-    assert [
-        text for text in messages if text.startswith("Stretch 'last' begins after iteration 2: environment.rewards.")
+    assert run.env.kind.tolist() != make(num_envs=12, terrain=STAIRS).kind.tolist()
+    assert [text[:77] for text in messages if text.startswith("Stretch")] == [
+        "Stretch 'last' begins after iteration 2: environment.rewards.tracking_sigma=0"
     ]
-    build(tmp_path / "first").learn(stop)
+    written = {path.name: read_checkpoint(path)["training"]["environment"]["stretch"] for path in folder.glob("*.pt")}
+    assert written == {"model_2.pt": 0, "model_3.pt": 1, "model_4.pt": 1}, "the boundary is a checkpoint"
+    assert run.contract.provenance["physics"]["trained"] == [[0.2, 1.25], [0.5, 0.6]]
+
+
+def test_levels_and_the_schedule_go_on_in_the_next_stretch(tmp_path):
+    env = make(num_envs=12, terrain=STAIRS, schedule=ScheduleConfiguration(horizon_steps=8, stretches=(LAST,)))
+    idle(env, 4)
+    env.parts.memory.level.copy_(torch.arange(12) % 3)
+    assert env.stretch_ends
+    assert env.next_stretch() == LAST and not env.stretch_ends
+    assert env.parts.memory.level.tolist() == [0, 1, 2] * 4
+    assert float(env.progress) == 0.5 and env.common_step_counter == 4
+
+
+@pytest.mark.parametrize("stop", [2, pytest.param(3, marks=pytest.mark.slow), pytest.param(1, marks=pytest.mark.slow)])
+def test_a_run_that_stops_in_any_stretch_goes_on_exactly(whole, tmp_path, stop):
+    """``stop`` 2 is the boundary: the checkpoint is of the first stretch, and what comes is of the second."""
+    folder, _, _ = whole
+    stopped = folder / f"model_{stop}.pt"
+    if not stopped.exists():
+        stopped = tmp_path / "first" / stopped.name
+        build(tmp_path / "first").learn(stop)
     resumed = build(tmp_path / "second", seed=5)
-    resume_run(resumed, tmp_path / "first" / f"model_{stop}.pt")
+    resume_run(resumed, stopped)
     resumed.learn(TOTAL - stop)
-    a, b = (read_checkpoint(tmp_path / name / "model_4.pt") for name in ("whole", "second"))
+    a, b = (read_checkpoint(each / "model_4.pt") for each in (folder, tmp_path / "second"))
     for name, value in a["actor_state_dict"].items():
         assert torch.equal(value, b["actor_state_dict"][name]), name
     for name, value in a["training"]["environment"]["memory"].items():
         assert torch.equal(value, b["training"]["environment"]["memory"][name]), name
     assert torch.equal(a["training"]["log"]["reward_sum"], b["training"]["log"]["reward_sum"])
-    assert a["training"]["environment"]["stretch"] == b["training"]["environment"]["stretch"] == 1
-
-
-def test_the_boundary_is_a_checkpoint(tmp_path):
-    build(tmp_path / "run").learn(TOTAL)
-    assert sorted(path.name for path in (tmp_path / "run").glob("model_*.pt")) == ["model_2.pt", "model_4.pt"]
-
-
-def test_the_physics_of_both_stretches_stand_in_the_policy(tmp_path):
-    run = build(tmp_path / "run", physics=lambda settings: {"trained": [list(settings.randomization.friction)]})
-    run.contract = replace(run.contract, provenance={**run.contract.provenance, "physics": {"trained": [[0.2, 1.25]]}})
-    run.learn(TOTAL)
-    assert run.contract.provenance["physics"]["trained"] == [[0.2, 1.25], [0.5, 0.6]]
 
 
 @pytest.mark.parametrize(

@@ -322,6 +322,8 @@ class TrainingEnvironment(VecEnv):
         log = self.parts.log.read(self.parts.memory, self.progress)
         if self.parts.scenarios is not None:
             log |= self.parts.scenarios.log()
+        if self._given.schedule.stretches:
+            log["Curriculum/stretch"] = torch.tensor(float(self.stretch))
         return log | {"Physics/overflow_worlds": self.backend.state.overflowed.sum().float()}
 
     # --- stretches --------------------------------------------------------------------------------------------------

@@ -44,8 +44,11 @@ def _render(run: Path, scores: str | None, scalars: Mapping[str, float]) -> str:
     result = None if folder is None else read_result(folder / "results.json", CheckpointError)
     films = sorted((run / VIDEO_FOLDER).glob("*.mp4"), key=lambda film: int(film.stem.split("_")[1]))
     last = [film for film in films if film.stem.split("_")[1] == films[-1].stem.split("_")[1]]
+    described = read_run_json(run)
+    schedule = described.get("settings", {}).get("environment", {}).get("schedule", {})
     return page_template(__file__, "training.html.j2", terrain=charts.terrain_label).render(
-        run=read_run_json(run),
+        run=described,
+        stretches=[each for each in schedule.get("stretches", []) if each["begin"] < 1.0],
         name=run.name,
         figures={n: charts.curves({n: [curves[n]]}) for n in FIGURES if any(curves.get(n, ((), ()))[1])},
         score=result,
