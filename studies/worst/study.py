@@ -18,7 +18,7 @@ from ...backends.registry import engine_class
 from ...files.choices import cpu_threads
 from ...files.parsing import shown
 from ...files.provenance import provenance
-from ...files.writing import json_text, write_atomically
+from ...files.writing import json_text, make_folder, write_atomically
 from ...gauge.suite import load_suite
 from ...robots import Robot
 from ...robots.loading import robot_digest
@@ -61,6 +61,8 @@ _REST, _REST_PLAYS = 0.4, 330
 """Largest share of the budget that is left to what follows the search, and about the plays that it takes."""
 _LEAST_SAMPLE, _MOST_SAMPLE = 30, 10_000
 """Least and largest number of cases of the random sample; 30 without a fall bound its probability by 10 %."""
+_MOST_FALLS = 200
+"""Falls of the random sample that are kept as scenarios."""
 _REDUCED = 12
 """Number of the sample's falls that lose their needless factors before the search."""
 
@@ -168,11 +170,14 @@ def search_worst(
         search = _Search(prepared, log, players, (1.0 - reserve) * 60.0 * prepared.request.minutes, watch)
         found = search.run()
         results = _results(prepared, search, found, command)
-        (folder / "scenarios").mkdir(exist_ok=True)
-        for failure in results["failures"]:
-            if failure["rank"] is not None:
-                scenario = search.scenario(search.case(failure["name"]))
-                write_atomically(folder / failure["scenario"], scenario_text(scenario), WorstError)
+        ranked = [f for f in results["failures"] if f["rank"] is not None]
+        fallen = [elite.case for elite in found.sampled if elite.outcome.fell][:_MOST_FALLS]
+        cases = {failure["scenario"]: search.case(failure["name"]) for failure in ranked}
+        cases |= {f"falls/{case.name}.toml": case for case in fallen}
+        for name in ("scenarios", "falls"):
+            make_folder(folder / name, WorstError)
+        for name, case in cases.items():
+            write_atomically(folder / name, scenario_text(search.scenario(case)), WorstError)
         write_atomically(folder / "worst.json", json_text(results), WorstError)
     return results
 

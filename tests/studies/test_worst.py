@@ -99,6 +99,8 @@ def test_the_search_finds_what_each_fall_needs_and_nothing_else(searched, tmp_pa
     for failure in results["failures"]:
         scenario = load_scenario(str(tmp_path / "out" / failure["scenario"]))
         assert scenario == played[scenario.name, scenario.title]
+    falls = [load_scenario(str(path)) for path in (tmp_path / "out" / "falls").glob("*.toml")]
+    assert len(falls) == min(results["sample"]["falls"], 200) and all(frail(scenario, "mujoco") for scenario in falls)
     found = {frozenset(f["factors"]): f for f in results["failures"]}
     assert set(found) == {frozenset({"payload"}), frozenset({"latency"}), frozenset({"push", "friction"})}
     assert all(f["confirmed"] for f in found.values())
