@@ -3,9 +3,9 @@
     python benchmarks/remaining_time.py evaluate jury --out timelines
     python benchmarks/remaining_time.py --replay timelines
 
-A command runs with a terminal of its own; every remaining time that it shows is noted with the time at which it is shown. Printed
-are, for each command, the error of the remaining time at each tenth of the command's duration (shown over true, less one), and
-the longest time without anything new on the terminal.
+A command runs with a terminal of its own, or with ``--pipe`` with a pipe; every remaining time that it shows is noted with the time
+at which it is shown. Printed are, for each command, the error of the remaining time at each tenth of the command's duration (shown
+over true, less one), and the longest time without anything new on the terminal.
 """
 
 from __future__ import annotations
@@ -39,20 +39,21 @@ _LEFT = re.compile(r"about (?:(\d+) h )?(?:(\d+) min ?)?(?:(\d+) s)? ?left")
 _CODES = re.compile(rb"\x1b\[[0-9;?]*[A-Za-z]")
 
 
-def record(arguments: Sequence[str]) -> dict[str, object]:
-    """Run a command line of ``gaitgauge`` on a terminal; return its timeline.
+def record(arguments: Sequence[str], *, pipe: bool = False) -> dict[str, object]:
+    """Run a command line of ``gaitgauge`` on a terminal, or into a ``pipe``; return its timeline.
 
     Returns:
         ``seconds``: the command's duration; ``shown``: pairs of a time and the remaining time shown at it, both in seconds;
-        ``silence``: the longest time without a change of the screen [s], ``silent_from``: its beginning; ``code``: exit code.
+        ``silence``: the longest time without a change of the screen [s], ``silent_from``: its beginning; ``code``: exit code;
+        ``last``: the last text.
     """
-    ours, theirs = pty.openpty()
+    ours, theirs = os.pipe() if pipe else pty.openpty()
     environment = os.environ | {"COLUMNS": "200", "TERM": "xterm"}
     began = time.monotonic()
     process = subprocess.Popen(
         [sys.executable, "-m", "gaitgauge.cli.main", *arguments],
         stdin=subprocess.DEVNULL,
-        stdout=subprocess.DEVNULL,
+        stdout=theirs,
         stderr=theirs,
         env=environment,
     )
@@ -84,6 +85,7 @@ def record(arguments: Sequence[str]) -> dict[str, object]:
         "silent_from": round(since, 2),
         "shown": [pair for i, pair in enumerate(shown) if i == 0 or pair[0] - shown[i - 1][0] > 0.2],
         "code": code,
+        "last": " ".join(before.decode(errors="replace").split()).strip("─│╭╮╰╯ ")[-200:],
     }
 
 
@@ -111,6 +113,8 @@ def table(timelines: dict[str, dict[str, object]]) -> str:
         cells = "".join(f"{'–':>7}" if e is None else f"{100 * e:>+6.0f}%" for e in found)
         worst = max((abs(e) for e in found if e is not None), default=float("nan"))
         quiet = f"{timeline['silence']:>7.1f} s from {timeline['silent_from']:.0f} s"
+        if timeline["code"]:
+            quiet += f"; failed: {timeline['last']}"
         lines.append(f"{name:<14}{timeline['seconds']:>8.1f}{cells}{100 * worst:>7.0f}%{quiet}")
     return "\n".join(lines)
 
@@ -125,6 +129,7 @@ def main() -> None:
         "--with", dest="files", action="append", default=[], metavar="NAME=FILE", help="a file for {NAME}"
     )
     parser.add_argument("--also", default="", help="further options of the commands")
+    parser.add_argument("--pipe", action="store_true", help="give commands a pipe in place of a terminal")
     options = parser.parse_args()
     timelines: dict[str, dict[str, object]] = {}
     if options.replay:
@@ -133,7 +138,7 @@ def main() -> None:
     for name in options.commands:
         with tempfile.TemporaryDirectory() as folder:
             line = COMMANDS[name].format_map(files) + f" {options.also} --out {folder}/out"
-            timelines[name] = record(shlex.split(line))
+            timelines[name] = record(shlex.split(line), pipe=options.pipe)
         if options.out:
             options.out.mkdir(parents=True, exist_ok=True)
             (options.out / f"{name}.json").write_text(json.dumps(timelines[name]) + "\n")

@@ -34,7 +34,7 @@ def run_consistency(request: StudyRequest, backends: str, *, out: Path | None, r
         results = study(
             prepared, folder, resume=resume, command=own, watch=partial(_show, display), told=partial(_tell, console)
         )
-    page = write_page(folder)
+        page = write_page(folder)
     if json_output:
         _print_skipped(console, results["skipped"][len(prepared.skipped) :])  # those that failed while they played
         print_json(results)

@@ -50,10 +50,10 @@ def run_evaluation(request: Request, *, out: Path | None, resume: bool, clip: bo
         result = evaluate(prepared, folder, resume=resume, command=command, watch=shower(display, film=clip))
         report = write_report(folder)
         sentence = _film(display, folder, request, result) if clip else None
+        if clip and sentence is None:
+            report = write_report(folder)  # with the film
     if sentence:
         console.say(sentence)
-    elif clip:
-        report = write_report(folder)
     if json_output:
         print_json(result.to_data())
         return

@@ -35,7 +35,7 @@ def run_jury(request: JuryRequest, engines: str, *, out: Path | None, resume: bo
     with resumable(console, "judging", folder, "--resume") as display:
         command = ["gaitgauge", *sys.argv[1:]]
         results = jury(prepared, folder, resume=resume, command=command, watch=lambda s: _show(display, s))
-    page = write_page(folder)
+        page = write_page(folder)
     show_results(results, print_jury, folder / "jury.json", page, json_output=json_output)
     unable = {engine["engine"]: engine["reason"] for block in results["policies"] for engine in block["unable"]}
     for name, reason in unable.items():

@@ -146,12 +146,15 @@ class _Watch:
         now = clock.monotonic()
         self._recent.append((now, progress.iteration))
         done, total = progress.iteration, progress.total_iterations
-        times = "estimating time"
-        if len(self._recent) > 1:
-            times = f"{self._duration(progress, now, total - done)} left"
+        text = f"iteration {done} of {total}"
+        if done >= total:
+            pass  # the film and the last score follow, which training waits for
+        elif len(self._recent) > 1:
+            text += f", {self._duration(progress, now, total - done)} left"
             if progress.next_score is not None:
-                times += f", score in {self._duration(progress, now, progress.next_score)}"
-        text = f"iteration {done} of {total}, {times}"
+                text += f", score in {self._duration(progress, now, progress.next_score)}"
+        else:
+            text += ", estimating time"
         self._display.update(done / total, text, _shown(progress), last=done >= total)
 
     def _duration(self, progress: Progress, now: float, remaining: int) -> str:

@@ -50,7 +50,7 @@ def run_worst(
             from .scenario_films import film_failures
 
             results = film_failures(prepared, folder, quality, lambda share, text: display.update(share, text))
-    page = write_page(folder)
+        page = write_page(folder)
     show_results(results, print_worst, folder / "worst.json", page, json_output=json_output)
 
 

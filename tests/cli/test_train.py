@@ -383,16 +383,17 @@ def test_the_time_until_the_next_score_is_told():
         def update(self, share, text, values, *, last):
             said.append(text)
 
-    now = iter((100.0, 102.0, 104.0))
+    now = iter((100.0, 102.0, 104.0, 280.0))
     watch = _Watch(Display(), deadline=None)
     with patch("gaitgauge.cli.train.clock.monotonic", lambda: next(now)):
-        for iteration, ahead in ((10, 40), (11, 39), (12, None)):
+        for iteration, ahead in ((10, 40), (11, 39), (12, None), (100, None)):
             figures = {"scalars": {}, "best_score": None, "best_iteration": None, "next_score": ahead}
             watch.update(Progress(iteration=iteration, total_iterations=100, elapsed=20.0, **figures))
     assert said == [
         "iteration 10 of 100, estimating time",
         "iteration 11 of 100, 2 min 58 s left, score in 1 min 18 s",
         "iteration 12 of 100, 2 min 56 s left",
+        "iteration 100 of 100",  # the film takes a minute, of which "0 s left" would be wrong
     ]
 
 
