@@ -7,14 +7,16 @@ import numpy as np
 import pytest
 import torch
 from gaitgauge.policy.export.files import ExportError, deploy_settings
+from gaitgauge.policy.robot_of import REMEMBERED
 from gaitgauge.robots import load_robot
 from gaitgauge.robots.anatomy.body_plan import default_pose
+from gaitgauge.robots.loading import robot_digest
 from gaitgauge.training.configuration import ConfigurationError
 from gaitgauge.training.environment.configuration import GaitConfiguration
 from gaitgauge.training.environment.environment import TrainingEnvironment
 from gaitgauge.training.environment.feet import FootReader
 from gaitgauge.training.environment.gait_rewards import pose_weights
-from gaitgauge.training.environment.policy_interface import driven_robot
+from gaitgauge.training.environment.policy_interface import driven_robot, training_contract
 from gaitgauge.training.environment.reward_configuration import PoseWeights, RewardConfiguration
 from gaitgauge.training.environment.terminations import TERMINATIONS
 from gaitgauge.training.tasks import find_task
@@ -144,3 +146,9 @@ def test_wrong_settings():
     with pytest.raises(ConfigurationError, match="offsets has 3 entries; robot 'g1' has 2 feet"):
         reader(period=0.5, offsets=(0.0, 0.2, 0.4))
     assert driven_robot(G1, walk).driven_joints == G1.joint_names[:12]
+
+
+def test_a_policy_for_driven_legs_remembers_the_robot_as_it_is_described():
+    contract = training_contract(G1, G1.parameters["training"], find_task("g1-walk").environment)
+    assert contract.joint_names == G1.joint_names[:12]
+    assert contract.provenance[REMEMBERED]["digest"] == robot_digest(G1)

@@ -100,8 +100,9 @@ class TrainingEnvironment(VecEnv):
             raise ConfigurationError(
                 f"environment.schedule.begin is {schedule.begin:g}; it is a fraction of the run, 0 to 1"
             )
-        whole = driven_robot(load_robot(configuration.robot), configuration)
-        self.contract = training_contract(whole, joint_parameters(whole, configuration), configuration)
+        described = load_robot(configuration.robot)
+        self.contract = training_contract(described, joint_parameters(described, configuration), configuration)
+        whole = driven_robot(described, configuration)
         check_stretches(configuration, whole, self.contract)
         self._model_folder = TemporaryDirectory(prefix="gaitgauge-robot-") if configuration.joints.rigid else None
         self.robot = whole if self._model_folder is None else welded(whole, Path(self._model_folder.name))

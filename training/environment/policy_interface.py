@@ -68,13 +68,14 @@ def largest_told(configuration: EnvironmentConfiguration) -> tuple[float, float,
 def training_contract(
     robot: Robot, parameters: JointParameters, configuration: EnvironmentConfiguration
 ) -> PolicyContract:
-    """Return the interface of a policy trained here: one frame of observation, the gains, the control period and the largest
-    commands of the training.
+    """Return the interface of a policy trained here: one frame of observation, the driven joints of the robot as it is described, the
+    gains, the control period and the largest commands of the training.
 
     Raises:
-        ConfigurationError: an observation of one's own is not there, or breaks a rule.
+        ConfigurationError: an observation of one's own is not there, or breaks a rule; a driven role that no joint has.
     """
     provenance = {REMEMBERED: identify(robot, configuration.robot)}
+    robot = driven_robot(robot, configuration)
     standard = standard_contract(
         robot, history=History(start=configuration.observations.history_start), provenance=provenance
     )
