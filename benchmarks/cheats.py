@@ -2,10 +2,11 @@
 
     python benchmarks/cheats.py pretrained --folder /tmp/cheats --threads 32 --filters 200 --fresh 20
 
-Seven terrains at one level, frictions 0.3, 0.6 and 0.9. Listed cheats (slower, capped along an axis, later, turning less, standing
-between) are played on the first five of the fresh seeds. Random filters are played on one seed each; the ten best of them are
-played again on the fresh seeds, which no choice has seen. A gain is the score with the filter minus the score without it, on the
-same seeds. Lower bounds are Student's over seeds, 95 % one-sided, with Holm's correction among the filters of a table.
+Seven terrains at one level, frictions 0.3, 0.6 and 0.9. Listed cheats (slower, capped along an axis, later, turning less,
+standing between) are played on the first five of the fresh seeds (``--listed`` for more). Random filters are played on one seed
+each; the ten best of them are played again on the fresh seeds, which no choice has seen. A gain is the score with the filter
+minus the score without it, on the same seeds. Lower bounds are Student's over seeds, 95 % one-sided, with Holm's correction among
+the filters of a table.
 
 At every terrain and friction the lower bound of a listed cheat must be at most 0, or 0.002 where the unfiltered policy falls; that of a
 random filter must be at most 0. Else the exit code is 1. What the folder holds is not played again. With 32 cores it takes
@@ -328,6 +329,7 @@ def main() -> int:
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--filters", type=int, default=200, help="random filters")
     parser.add_argument("--fresh", type=int, default=20, help="seeds on which the ten best are played again")
+    parser.add_argument("--listed", type=int, default=_LISTED_SEEDS, help="of these seeds, those of the listed cheats")
     parser.add_argument("--level", type=int, default=5, help="of the terrains that have levels")
     parser.add_argument("--terrain", action="append", help="instead of all of the suite; more than once for several")
     parser.add_argument("--friction", type=float, action="append", help="instead of 0.3, 0.6 and 0.9")
@@ -342,9 +344,9 @@ def main() -> int:
     stamp.write_text(identity)
     _shared.update(prepared=prepared, level=arguments.level)
     terrains = arguments.terrain or list(prepared.suite.matrix.terrains)
-    fresh = [_FRESH + s for s in range(max(arguments.fresh, _LISTED_SEEDS))]
+    fresh = [_FRESH + s for s in range(max(arguments.fresh, arguments.listed))]
     frictions = tuple(arguments.friction or FRICTIONS)
-    few, scores = fresh[:_LISTED_SEEDS], Scores(frictions=frictions)
+    few, scores = fresh[: arguments.listed], Scores(frictions=frictions)
 
     def plays(changes: Sequence[Filter], seeds: Sequence[int]) -> list[Play]:
         places = [(t, some) for t in terrains for some in chunks(seeds)]
@@ -360,12 +362,12 @@ def main() -> int:
         screened = {c.name: float(scores.gains(c.name, terrains, [_SCREEN])[0]) for c in candidates}
         best = dict(sorted(screened.items(), key=lambda item: -item[1])[:_BEST])
         play_all(
-            plays([NONE, *(random_filter(_number(name)) for name in best)], fresh),
+            plays([NONE, *(random_filter(_number(name)) for name in best)], fresh[: arguments.fresh]),
             arguments.folder,
             arguments.threads,
             scores,
         )
-        kept &= judge_random(scores, terrains, best, fresh)
+        kept &= judge_random(scores, terrains, best, fresh[: arguments.fresh])
         print(
             f"\nof {len(candidates)} random filters {sum(g > 0 for g in screened.values())} gained on the screen's seed"
         )
