@@ -63,6 +63,7 @@ FACTORS: tuple[Factor, ...] = (
     Factor(name="timestep-1ms", title="timestep 1 ms", option="timestep", value=0.001),
     Factor(name="timestep-5ms", title="timestep 5 ms", option="timestep", value=0.005),
     Factor(name="cone", title="pyramidal friction cone", option="cone", value="pyramidal"),
+    Factor(name="feet", title="feet that turn and roll freely", option="foot_condim", value=3),
     Factor(name="impratio", title="impratio 1", option="impratio", value=1.0),
     Factor(name="iterations", title="3 solver iterations", option="iterations", value=3),
     Factor(name="tolerance", title="solver tolerance 1e-5", option="tolerance", value=1e-5),
