@@ -55,6 +55,7 @@ def run_preflight(request: PreflightRequest, *, out: Path | None, json_output: b
         table.add_row(finding["check"], finding["verdict"], finding["sentence"], style=style)
     console.print(table)
     console.say(f"results  {folder / 'preflight.json'}")
+    console.say(f"page     {folder / 'preflight.html'}")
     return bool(results["passed"])
 
 

@@ -130,6 +130,10 @@ def make_log(name: str, robot: Robot, columns: Mapping[str, Any], *, notes: Sequ
         raise LogError(
             f"{source}: {found['repeated']} of {len(time)} rows repeat the row before; log no faster than the robot reports"
         )
+    if (usual := float(np.median(steps))) > LONGEST_GAP:
+        raise LogError(
+            f"{source}: its rows are {usual:.3g} apart in time; the time must be in seconds, in rows of a few ms"
+        )
     if (longest := int(steps.argmax())) >= 0 and steps[longest] > LONGEST_GAP:
         gap = f"no row for {steps[longest]:.2f} s after {time[longest] - time[0]:.2f} s"
         raise LogError(f"{source} has {gap}; cut the log there (--from, --to), {LONGEST_GAP:g} s are allowed")

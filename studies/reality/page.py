@@ -1,4 +1,4 @@
-"""``replay.html``: traces, residuals in time and over frequency, and a table by group of joints. One page that loads nothing."""
+"""Pages on logs, ``replay.html`` and others, each one file that loads nothing: traces, residuals, tables."""
 
 from __future__ import annotations
 
@@ -30,6 +30,17 @@ def render_page(results: Mapping[str, Any], pictures: Sequence[Any]) -> str:
 def render_identified(results: Mapping[str, Any]) -> str:
     """Return the page of an identification as HTML text."""
     return page_template(__file__, "identify.html.j2", number=_number).render(results=results)
+
+
+def render_preflight(results: Mapping[str, Any], log: Log, pose: Array) -> str:
+    """Return the page of a preflight as HTML text; ``pose`` is the policy's in the log's order of joints [rad], (J,)."""
+    charts = {}
+    for j, joint in enumerate(log.robot.joint_names):
+        lines = {"recorded": log.position[:, j], "target": log.target[:, j], "pose": np.full(len(log.time), pose[j])}
+        charts[joint] = _chart(log.time, lines, "position [rad]", "time [s]")
+    wrong = sum(finding["verdict"] == "wrong" for finding in results["findings"])
+    template = page_template(__file__, "preflight.html.j2", number=_number)
+    return template.render(results=results, charts=charts, wrong=wrong)
 
 
 def _unit(quantity: str) -> str:

@@ -15,7 +15,9 @@ from ...files.writing import json_text, write_files
 from ...policy.contract import PolicyContract, check_robot
 from ...policy.loading import load_policy
 from ...policy.robot_of import robot_for
+from ...robots import Robot
 from .log import Array, Log, LogError
+from .page import render_preflight
 from .replaying import fit_delay, read_logs
 from .request import PreflightRequest
 from .rig import FixedRig, acting_parameters, at_rows, beginning, held_targets, num_steps
@@ -61,8 +63,16 @@ def preflight(request: PreflightRequest, folder: Path, *, command: Sequence[str]
         "passed": not any(finding.verdict == "wrong" for finding in findings),
         "provenance": provenance(command=command, seconds=round(time.perf_counter() - began, 2)),
     }
-    write_files(folder, {"preflight.json": json_text(results)}, LogError)
+    page = render_preflight(results, log, _pose_of(policy.contract, robot))
+    write_files(folder, {"preflight.json": json_text(results), "preflight.html": page}, LogError)
     return results
+
+
+def _pose_of(contract: PolicyContract, robot: Robot) -> Array:
+    """Return the pose around which the policy acts, in the robot's order of joints [rad], (J,)."""
+    pose = np.array(robot.default_joint_position)
+    pose[list(check_robot(contract, robot))] = contract.action_offset or contract.default_joint_position
+    return pose
 
 
 def _with_robot(request: PreflightRequest, robot: str) -> PreflightRequest:
@@ -87,6 +97,8 @@ def _finding(check: str, wrong: str, fine: str, *, told: bool = True) -> Finding
 
 
 def _names(log: Log, joints: Any) -> str:
+    if len(joints) == log.robot.num_joints > 1:
+        return "every joint"
     return ", ".join(log.robot.joint_names[j].removesuffix("_joint") for j in joints)
 
 

@@ -244,7 +244,9 @@ def _read_csv(path: Path, mapping: LogMap, source: str) -> _Raw:
     """Read one of the three kinds of CSV; the header tells which."""
     text = read_text(path, "log", LogError, largest=LARGEST_LOG)
     rows = list(csv.reader(io.StringIO(text)))
-    header = [name.strip() for name in rows[0]] if rows else []
+    if not rows:
+        raise LogError(f"{source} is empty; a log begins with the names of its columns")
+    header = [name.strip() for name in rows[0]]
     body = [row for row in rows[1:] if any(row)]
     table = {name: i for i, name in enumerate(header) if name}
 

@@ -100,6 +100,8 @@ def test_a_log_of_another_robot_is_refused(log, tmp_path):
     save_log(log, tmp_path / "log.npz")
     results = preflight(PreflightRequest(policy="pretrained", log=tmp_path / "log.npz"), tmp_path / "out")
     assert results["passed"] and (tmp_path / "out" / "preflight.json").is_file()
+    page = (tmp_path / "out" / "preflight.html").read_text(encoding="utf-8")
+    assert "Nothing is wrong in log.npz" in page and page.count("<svg") == 12
     names = np.array([name.replace("calf", "shin") for name in GO2.joint_names])
     gains = {"stiffness": log.stiffness, "damping": log.damping}
     np.savez(tmp_path / "b.npz", time=log.time, target=log.target, position=log.position, joint_names=names, **gains)

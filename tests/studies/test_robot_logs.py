@@ -171,6 +171,7 @@ def test_bad_rows_are_counted_and_handled(log, tmp_path):
         (lambda c: {k: v for k, v in c.items() if k != "target"}, "lacks target"),
         (lambda c: {k: v for k, v in c.items() if k != "stiffness"}, "does not say with which stiffness"),
         (lambda c: c | {"time": c["time"][::-1]}, "the time does not rise"),
+        (lambda c: c | {"time": 1e3 * c["time"]}, "rows are 2 apart in time; the time must be in seconds"),
         (lambda c: c | {"position": c["position"][:, :5]}, "it must be"),
         (lambda c: c | {"held": np.array("upside down")}, "held is 'upside down'"),
     ],
@@ -184,9 +185,11 @@ def test_what_cannot_be_used_is_refused_in_a_sentence(log, tmp_path, change, sen
 def test_files_that_are_no_logs_are_refused(tmp_path):
     (tmp_path / "a.npz").write_bytes(b"PK nonsense")
     (tmp_path / "b.csv").write_text("a,b\n1,2\n", encoding="utf-8")
+    (tmp_path / "e.csv").write_text("", encoding="utf-8")
     for name, sentence in (
         ("a.npz", "is no .npz file"),
         ("b.csv", "known are"),
+        ("e.csv", "is empty"),
         ("c.bag", "logs end in"),
         ("d.npz", "does not exist"),
     ):
