@@ -230,6 +230,7 @@ _OWN = (
         build=lambda state, command, last_action: state.base_position_w[:, 2:],
         width=1,
         unit="m",
+        foreign_names=("height_scan", "height_scanner"),
         noise="height_scan",
         exteroceptive=True,
     ),

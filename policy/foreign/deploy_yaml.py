@@ -11,9 +11,9 @@ from ...files.parsing import parse_yaml, read_text
 from ...robots.base import Robot
 from ..base import PolicyError
 from ..contract import History, HistoryOrder, ObservationTerm, Part, PolicyContract, without_wheels
-from ..observation_table import WITHOUT_WHEELS
+from ..observation_table import HEIGHT_SCAN, WITHOUT_WHEELS
 from .bodies import choose_robot, sdk_joints, wheels_of
-from .terms import checked, clip_before_scaling, listed, own_term, symmetric
+from .terms import ISAAC_HEIGHT, checked, clip_before_scaling, listed, own_term, symmetric, usual_scan
 
 
 def is_deploy(data: Mapping[str, Any]) -> bool:
@@ -59,7 +59,7 @@ def _read(data: Mapping[str, Any], path: Path, robot: Robot) -> PolicyContract:
     sdk = [int(i) for i in data["joint_ids_map"]]
     default = [float(v) for v in data["default_joint_pos"]]
     actions = dict(data["actions"])
-    wheels = wheels_of(_wheels(actions, names), robot, path)
+    wheels = wheels_of(_wheels(actions, names, robot, path), robot, path)
     action = _joined(actions, default, names, wheels, path)
     offset = [float(v) for v in action["offset"]]
     moved = max((abs(o - d) for o, d in zip(offset, default, strict=True)), default=0.0) > 1e-6
@@ -73,7 +73,7 @@ def _read(data: Mapping[str, Any], path: Path, robot: Robot) -> PolicyContract:
     settings = dict(data["observations"])
     frame_major = bool(settings.pop("use_gym_history", False))
     scale_first = bool(settings.pop("scale_first", False))
-    terms, lengths = [], []
+    terms, lengths, assumed = [], [], []
     for name, term in settings.items():
         own, scale = own_term(name, path), tuple(float(s) for s in listed(term.get("scale"), 1.0))
         if name == WITHOUT_WHEELS:
@@ -82,8 +82,14 @@ def _read(data: Mapping[str, Any], path: Path, robot: Robot) -> PolicyContract:
         if (given := term.get("clip")) is not None:
             limit = symmetric(float(given[0]), float(given[1]), name, path)
             clip_of_term = (limit,) if scale_first else clip_before_scaling(limit, scale)
-        period = float((term.get("params") or {})["period"]) if own == "gait_phase" else None
-        terms.append(ObservationTerm(name=own, scale=scale, clip=clip_of_term, period=period))
+        given = term.get("params") or {}
+        period = float(given["period"]) if own == "gait_phase" else None
+        height = None
+        if own == HEIGHT_SCAN:
+            height = float(given.get("offset", ISAAC_HEIGHT))
+            assumed.append(usual_scan(height))
+        reference = None if height is None else (height,)
+        terms.append(ObservationTerm(name=own, scale=scale, clip=clip_of_term, period=period, reference=reference))
         lengths.append(int(term.get("history_length") or 1))
     longest = max(lengths, default=1)
     alike = len(set(lengths)) <= 1
@@ -96,7 +102,9 @@ def _read(data: Mapping[str, Any], path: Path, robot: Robot) -> PolicyContract:
     parts = () if alike else tuple(Part(terms=(t.name,), length=n) for t, n in zip(terms, lengths, strict=True))
     provenance = {"adapter": "deploy.yaml", "file": path.name}
     if missing := [axis for axis in axes if not ranges.get(axis)]:
-        provenance["assumed"] = f"command limits of robot '{robot.name}' ({', '.join(missing)})"
+        assumed.append(f"command limits of robot '{robot.name}' ({', '.join(missing)})")
+    if assumed:
+        provenance["assumed"] = "; ".join(assumed)
     return PolicyContract(
         robot=robot.name,
         joint_names=names,
@@ -119,18 +127,25 @@ def _read(data: Mapping[str, Any], path: Path, robot: Robot) -> PolicyContract:
 _ACTIONS = ("JointPositionAction", "JointVelocityAction")
 
 
-def _wheels(actions: Mapping[str, Any], names: Sequence[str]) -> Sequence[object]:
+def _wheels(actions: Mapping[str, Any], names: Sequence[str], robot: Robot, path: Path) -> Sequence[object]:
     """Return what a file says of the joints that it drives by velocity: their numbers in the policy's order, else names or patterns."""
     action = actions.get("JointVelocityAction")
     if action is None:
         return []
-    return _joints(action, names) or listed(action.get("joint_names"), ".*")
+    numbered = _joints(action, names, path) if robot.velocity_joints else []
+    return numbered or listed(action.get("joint_names"), ".*")
 
 
-def _joints(action: Mapping[str, Any], names: Sequence[str]) -> list[str]:
+def _joints(action: Mapping[str, Any], names: Sequence[str], path: Path) -> list[str]:
     """Return the joints that an action numbers in the policy's order; none where it means all that its kind fits."""
     ids = action.get("joint_ids")
-    return [names[int(i)] for i in ids] if isinstance(ids, list) and None not in ids else []
+    if not isinstance(ids, list) or None in ids:
+        return []
+    if not all(0 <= int(i) < len(names) for i in ids):
+        raise PolicyError(
+            f"'{path}' drives the joints {ids}; its joint_ids_map has {len(names)}, from 0 to {len(names) - 1}; both must agree"
+        )
+    return [names[int(i)] for i in ids]
 
 
 def _joined(
@@ -145,7 +160,7 @@ def _joined(
     order: list[str] = []
     for kind in (kind for kind in actions if kind in _ACTIONS):
         action, turned = actions[kind], kind == "JointVelocityAction"
-        mine = _joints(action, names) or [n for n in names if (n in wheels) == turned]
+        mine = _joints(action, names, path) or [n for n in names if (n in wheels) == turned]
         order += mine
         usual = [0.0 if turned else default[names.index(n)] for n in mine]
         found["scale"] += listed(action.get("scale"), 1.0, len(mine))

@@ -8,15 +8,16 @@ from collections.abc import Mapping
 from ...robots.base import Robot
 from ..base import PolicyError
 from ..contract import History, ObservationTerm, PolicyContract
+from ..observation_table import HEIGHT_SCAN
 from .bodies import choose_robot, matching_joint
-from .terms import checked, clip_before_scaling, own_term, symmetric
+from .terms import checked, clip_before_scaling, own_term, symmetric, usual_scan
 
 
 def mjlab_contract(metadata: Mapping[str, str], asked: Robot | None, *, source: str) -> PolicyContract | None:
     """Return the contract that the metadata describe; None if they are not there.
 
     Histories are term-major and start with copies of the first observation. The command limits are the robot's and the
-    control period is 0.02 s, mjlab's, because the metadata name neither.
+    control period is 0.02 s, mjlab's, because the metadata name neither; nor do they name the grid of a height scan.
 
     Raises:
         PolicyError: the metadata are incomplete or malformed.
@@ -55,6 +56,8 @@ def _mjlab_contract(metadata: Mapping[str, str], robot: Robot, source: str) -> P
         clip = clip_before_scaling(limit, scale)
         known = None if limit == math.inf else clip if len(clip) > 1 else clip[0]
         terms.append(ObservationTerm(name=term, scale=scale, clip=known))
+    assumed = ["control period 0.02 s", f"command limits of robot '{robot.name}'"]
+    assumed += [usual_scan(0.0)] if HEIGHT_SCAN in own else []
     action_scale = [float(v) for v in words("action_scale")]
     return PolicyContract(
         robot=robot.name,
@@ -70,6 +73,6 @@ def _mjlab_contract(metadata: Mapping[str, str], robot: Robot, source: str) -> P
         provenance={
             "adapter": "mjlab metadata",
             "file": source,
-            "assumed": f"control period 0.02 s, command limits of robot '{robot.name}'",
+            "assumed": ", ".join(assumed),
         },
     )

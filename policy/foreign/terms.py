@@ -10,6 +10,14 @@ from ..base import PolicyError
 from ..contract import ContractError
 from ..observation_table import ObservationError, foreign_observation
 
+ISAAC_HEIGHT = 0.5
+"""Height of the base over the ground that Isaac Lab's height scan calls zero, unless it is told another [m]."""
+
+
+def usual_scan(height: float) -> str:
+    """Return what is assumed of a height scan that a file names without its grid; ``height``: of the base, which it calls zero [m]."""
+    return f"the height scan's usual grid, 1.6 by 1 m, 0.1 m apart, x first, less {height:g} m (a contract.toml gives another)"
+
 
 @contextmanager
 def checked(source: object, what: str) -> Iterator[None]:

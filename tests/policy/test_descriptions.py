@@ -105,12 +105,12 @@ def test_histories_of_different_lengths_in_a_deploy_file(tmp_path):
     ("changes", "sentence"),
     [
         (
-            {"actions": {"JointVelocityAction": {"joint_names": [".*_wheel_joint"], "scale": 5.0}}},
-            "drives joints by velocity (.*_wheel_joint), as wheels are",
+            {"actions": {"JointVelocityAction": {"joint_names": [".*_wheel_joint"], "joint_ids": [12, 13, 14, 15]}}},
+            "drives joints by velocity (.*_wheel_joint), as wheels are, and robot 'go2' takes targets of angle alone",
         ),
         (
-            {"terms": {"height_scanner": {"params": {}, "scale": 1.0}}},
-            "asks for the observation 'height_scanner'; supported are",
+            {"terms": {"camera": {"params": {}, "scale": 1.0}}},
+            "asks for the observation 'camera'; supported are",
         ),
     ],
 )

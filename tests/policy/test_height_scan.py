@@ -17,6 +17,7 @@ from gaitgauge.policy.contract import (
     standard_contract,
 )
 from gaitgauge.policy.export.files import ExportError, deploy_settings
+from gaitgauge.policy.foreign.deploy_yaml import read_deploy
 from gaitgauge.policy.foreign.isaac_lab import read_env
 from gaitgauge.policy.ground import Ground
 from gaitgauge.policy.observation import ObservationBuilder
@@ -144,6 +145,17 @@ def env(**scanner):
         "sim": {"dt": 0.005}, "decimation": 4, "actions": {"joint_pos": action}, "commands": {},
         "observations": {"policy": {"height_scan": term}}, "scene": {"robot": robot, "height_scanner": sensor},
     }  # fmt: skip
+
+
+def test_a_deploy_file_has_the_usual_grid_and_says_so():
+    settings = deploy_settings(standard_contract(GO2), GO2)
+    settings["observations"]["height_scanner"] = {"params": {}, "clip": [-1.0, 1.0], "scale": 1.0, "history_length": 1}
+    contract = read_deploy(settings, Path("deploy.yaml"), GO2)
+    found = contract.observation[-1]
+    assert found == ObservationTerm(name="height_scan", scale=(1.0,), reference=(0.5,), clip=(1.0,))
+    assert contract.provenance["assumed"].startswith(
+        "the height scan's usual grid, 1.6 by 1 m, 0.1 m apart, x first, less 0.5 m"
+    )
 
 
 def test_isaac_labs_height_scanner_is_read():

@@ -265,6 +265,14 @@ def mjlab_metadata(go2, **changes: str) -> dict[str, str]:
     return {**metadata, **changes}
 
 
+SCANNED = {
+    "observation_names": "height_scan",
+    "observation_terms_scale": "0.2",
+    "observation_terms_clip": "-1;1",
+    "observation_terms_history_length": "0",
+}
+
+
 def test_mjlab_metadata(tmp_path, go2):
     policy = load_policy(linear(tmp_path / "policy.onnx", 48, **mjlab_metadata(go2)), go2)
     assert policy.contract.action_scale == (0.5,) * 12
@@ -272,6 +280,10 @@ def test_mjlab_metadata(tmp_path, go2):
     assert policy.contract.observation[1].clip == 4.5
     assert policy.contract.history == History(length=1, start="repeat")
     lengths = mjlab_metadata(go2, observation_terms_history_length=",".join("4" * 7))
+    scan = {key: f"{mjlab_metadata(go2)[key]},{own}" for key, own in SCANNED.items()}
+    seeing = load_policy(linear(tmp_path / "policy.onnx", 235, **mjlab_metadata(go2, **scan))).contract
+    assert (seeing.observation[-1].name, seeing.observation[-1].clip) == ("height_scan", 0.2)
+    assert "usual grid, 1.6 by 1 m, 0.1 m apart, x first, less 0 m" in seeing.provenance["assumed"]
     stacked = load_policy(linear(tmp_path / "policy.onnx", 192, **lengths))
     assert stacked.contract.history == History(length=4, order="term-major", start="repeat")
 
@@ -279,7 +291,7 @@ def test_mjlab_metadata(tmp_path, go2):
 @pytest.mark.parametrize(
     ("changes", "named"),
     [
-        ({"observation_names": "height_scan"}, "height_scan"),
+        ({"observation_names": "camera"}, "camera"),
         ({"action_scale": "big"}, "big"),
         ({"joint_stiffness": "20"}, "stiffness"),
         ({"observation_terms_scale": "1.0"}, "metadata"),

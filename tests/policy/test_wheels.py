@@ -32,6 +32,12 @@ def test_a_deploy_file_keeps_legs_and_wheels():
         PolicyError, match=r"has actions for FL_foot_joint, .*, in this order; its joint_ids_map has FL_hip"
     ):
         read_deploy(settings, Path("deploy.yaml"), GO2W)
+    again = deploy_settings(contract, GO2W)
+    again["actions"]["JointVelocityAction"]["joint_ids"] = [12, 13, 14, 16]
+    with pytest.raises(
+        PolicyError, match=r"drives the joints \[12, 13, 14, 16\]; its joint_ids_map has 16, from 0 to 15"
+    ):
+        read_deploy(again, Path("deploy.yaml"), GO2W)
     with pytest.raises(
         PolicyError, match="as wheels are, and robot 'go2' takes targets of angle alone; choose another"
     ):
