@@ -21,6 +21,7 @@ from ..files.choices import (
     ContractName,
     DeviceName,
     EngineName,
+    ParameterSet,
     PolicyName,
     RobotName,
     ThreadCount,
@@ -71,6 +72,7 @@ class PlayRequest:
     trust: Trust = False
     robot: RobotName = None
     contract: ContractName = None
+    parameters: ParameterSet = None
     suite: Annotated[str, _SUITE] = "gaitgauge-1"
 
 

@@ -8,6 +8,7 @@ from typing import Any
 
 from ..backends.registry import choose_device
 from ..gauge.ground_rules import build_terrain
+from ..gauge.motors import with_parameters
 from ..gauge.suite import load_suite
 from ..policy.base import Policy
 from ..policy.loading import own_contract
@@ -35,7 +36,7 @@ class WorldMaker:
         self._policies: dict[str, tuple[Policy, Robot]] = {}
 
     def make(self, choice: str, terrain: str, level: int | None, friction: float, label: str) -> PlaySession:
-        """Return a robot with a policy on a terrain. Raises PolicyError, ContractError, TerrainError, BackendError, UserError."""
+        """Return a robot with a policy on a terrain; raise Policy-, Contract-, Robot-, Terrain-, BackendError or UserError."""
         if choice not in self._policies:
             self._policies[choice] = open_policy(
                 choice,
@@ -44,7 +45,9 @@ class WorldMaker:
                 contract_file=own_contract(choice, self._request.contract),
             )
         policy, robot = self._policies[choice]
-        ground = build_terrain(self._settings["suite"].ground, robot, terrain, level)
+        suite = self._settings["suite"]
+        robot = with_parameters(suite, robot, self._request.parameters)
+        ground = build_terrain(suite.ground, robot, terrain, level)
         return PlaySession(policy, robot, ground, friction=friction, label=label, **self._settings)
 
     def make_all(self, policies: Sequence[str], terrain: str, level: int | None, friction: float) -> list[PlaySession]:

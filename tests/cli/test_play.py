@@ -44,6 +44,11 @@ def test_world_is_that_of_the_suite(session, tmp_path):
     assert session(suite=str(suite)).backend.scene.physics.substeps == 4
 
 
+def test_world_has_the_parameter_set_that_was_asked_for(session):
+    played = session(parameters="identified").backend.scene.parameters
+    assert played.armature == ROBOT.parameters["identified"].armature != ROBOT.parameters["gauge"].armature
+
+
 def test_fallen_robot_is_shown_and_starts_again(session):
     played = session()
     side = torch.tensor([[math.cos(math.pi / 4), math.sin(math.pi / 4), 0.0, 0.0]], dtype=torch.float64)
