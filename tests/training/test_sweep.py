@@ -5,16 +5,20 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from gaitgauge.files.parsing import one_line
+from gaitgauge.gauge.chance.intervals import Chance
 from gaitgauge.gauge.report.page import charts
 from gaitgauge.training.run.checkpoint import CheckpointError
+from gaitgauge.training.sweep.across import across_seeds, chance_of_seeds
 from gaitgauge.training.sweep.curves import by_figure, curves_csv
 from gaitgauge.training.sweep.file import SweepEntry, SweepError, load_sweep
-from gaitgauge.training.sweep.folding import _entry, across_seeds, fold_sweep
+from gaitgauge.training.sweep.folding import _entry, fold_sweep
 from gaitgauge.training.sweep.runs import SweepRun, plan_runs
 from gaitgauge.training.tasks import find_task
+from sample_results import sample
 from scipy.stats import t as student_t
 from scripted_sweep import ENTRY, SWEEP, scripted, work
 
@@ -91,7 +95,7 @@ def test_shipped_sweeps_could_start(tmp_path, path):
     runs, refused = plan_runs(
         replace(sweep, entry=tuple(replace(entry, device="cpu") for entry in sweep.entry)), tmp_path
     )
-    assert refused == {} and len(runs) == len(sweep.entry) * len(sweep.seeds)
+    assert refused == {} and len(runs) == sum(len(sweep.seeds_of(entry)) for entry in sweep.entry)
 
 
 @pytest.mark.parametrize("name", ["baselines", "moe-ablation", "strategies"])
@@ -326,12 +330,48 @@ def test_a_seed_is_drawn_alike_whether_or_not_earlier_ones_have_a_curve():
 
 def test_entries_are_compared_over_their_seeds():
     """By hand: means 2 and 6, variances 1 and 4 of three runs each, so t = 4 / sqrt(5 / 3) with (5/3)² / (1/18 + 8/9) degrees."""
-    found = across_seeds({"a": [0.1, 0.2, 0.3], "alone": [0.5], "b": [0.4, 0.6, 0.8], "c": [0.15, 0.2, 0.25]})
+    found = across_seeds({"a": [0.1, 0.2, 0.3], "b": [0.4, 0.6, 0.8], "c": [0.15, 0.2, 0.25]})
     assert [(p["first"], p["second"]) for p in found] == [("a", "b"), ("a", "c"), ("b", "c")]
     expected = 2.0 * student_t.sf(4.0 / (5.0 / 3.0) ** 0.5, (5.0 / 3.0) ** 2 / (1.0 / 18.0 + 8.0 / 9.0))
     assert found[0]["difference"] == pytest.approx(0.4) and found[0]["p_value"] == pytest.approx(expected)
     assert found[0]["corrected"] == pytest.approx(min(3.0 * expected, 1.0)) and found[1]["p_value"] == pytest.approx(
         1.0
     )
-    assert across_seeds({"a": [0.5, 0.5], "b": [0.6, 0.6], "c": [0.6, 0.7]}) == [], "copies of a run are no seeds"
+    found = across_seeds({"a": [0.5, 0.5], "b": [0.6, 0.6], "c": [0.6, 0.7]})
+    assert found == [], "copies of a run are no seeds"
+
+
+def test_an_entry_with_one_run_has_the_pooled_spread_of_the_others():
+    """By hand: variances 1 and 4 with two degrees each, pooled 2.5 with four; (0.9 - 0.2) against sqrt(1/3 + 2.5)."""
+    found = across_seeds({"a": [0.1, 0.2, 0.3], "b": [0.4, 0.6, 0.8], "alone": [0.9]})
+    pair = next(p for p in found if (p["first"], p["second"]) == ("a", "alone"))
+    assert pair["error"] == pytest.approx((1.0 / 3.0 + 2.5) ** 0.5 / 10.0)
+    freedom = (1.0 / 3.0 + 2.5) ** 2 / (1.0 / 9.0 / 2.0 + 2.5**2 / 4.0)
+    assert pair["p_value"] == pytest.approx(2.0 * student_t.sf(0.7 / pair["error"], freedom))
+
+
+def test_a_seed_of_the_gauge_that_is_easy_for_one_entry_counts_and_one_that_is_easy_for_all_does_not():
+    """By hand: runs without spread but for 0.001; deviations that differ by 0.03, -0.03 and 0 between the entries."""
+    scores = {"a": [0.5, 0.502], "b": [0.6, 0.602]}
+
+    def chances(own):
+        easy = np.array([[0.2, -0.1, -0.1]])
+        return {"a": Chance(levels=np.zeros(1), seeds=(easy,)), "b": Chance(levels=np.zeros(1), seeds=(easy + own,))}
+
+    training = 2 * 2e-6 / 2
+    alike = across_seeds(scores, chances(np.zeros((1, 3))))[0]
+    assert alike["error"] == pytest.approx(training**0.5) and alike["p_value"] == across_seeds(scores)[0]["p_value"]
+    apart = across_seeds(scores, chances(np.array([[0.03, -0.03, 0.0]])))[0]
+    assert apart["error"] == pytest.approx((training + 0.0018 / 6) ** 0.5)
+    assert apart["p_value"] > alike["p_value"]
+
+
+def test_the_seeds_of_a_card_are_the_mean_of_its_entrys_runs():
+    one = sample(suite="quick")
+    table = chance_of_seeds([one, one]).seeds[0]
+    assert table.shape[1] == len(one.chance.seeds) and table.sum(axis=1) == pytest.approx(0.0, abs=1e-9)
+    assert np.array_equal(table, chance_of_seeds([one]).seeds[0])
+
+
+def test_entries_without_a_spread_are_not_compared():
     assert across_seeds({"a": [0.5], "b": [0.6, 0.6]}) == []

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Mapping, Sequence
-from itertools import combinations
 from pathlib import Path
 from typing import Any
 
-from scipy.stats import ttest_ind
-
 from ...files.writing import json_text, write_atomically
+from ...gauge.chance.intervals import Chance
 from ...gauge.report import charts
 from ...gauge.report.pages import page_template
-from ...gauge.result import CONFIDENCE
-from ...studies.compare.comparison import ComparisonError, compare, format_p, holm, load_result
+from ...gauge.result import Result, read_result
+from ...studies.compare.comparison import ComparisonError, compare, load_result
 from ...studies.compare.report import write_comparison
+from .across import across_seeds, chance_of_seeds
+from .across import sentence as across_sentence
 from .curves import Curve, by_figure, curves_csv, learning_curves
 from .file import Sweep, SweepError
 from .runs import RUN_ERRORS, SCORES, SweepRun, read_card, what_failed
@@ -64,8 +64,8 @@ def fold_sweep(
     scores = {
         e.name: [r["score"] for r in rows if r["entry"] == e.name and r["score"] is not None] for e in sweep.entry
     }
-    pairs = across_seeds(scores)
-    sentences += [_seeds_sentence(pairs)] if pairs else []
+    pairs = across_seeds(scores, _gauge_seeds(rows, folder) if compared else None)
+    sentences += [across_sentence(pairs)] if pairs else []
     if alike := [name for name, own in scores.items() if len(own) > 1 and len(set(own)) == 1]:
         sentences.append(f"All seeds of {_listed(alike)} have the same score, which says nothing of their spread.")
     if other := [r.label for r, row in zip(runs, rows, strict=True) if row["state"] == "trained" and r.has_results]:
@@ -104,6 +104,15 @@ def _fill(row: dict[str, Any], sweep: Sweep, run: SweepRun, folder: Path) -> Non
         row |= {"state": "gauged", "results": str(results.relative_to(folder))}
 
 
+def _gauge_seeds(rows: Sequence[Mapping[str, Any]], folder: Path) -> dict[str, Chance]:
+    """Return what the gauge's seeds add to each entry's mean score."""
+    cards: dict[str, list[Result]] = {}
+    for row in rows:
+        if row["results"] is not None:
+            cards.setdefault(row["entry"], []).append(read_result(folder / row["results"], SweepError))
+    return {name: chance_of_seeds(own) for name, own in cards.items()}
+
+
 def _entry(name: str, rows: Sequence[Mapping[str, Any]], refused: str | None) -> dict[str, Any]:
     """An entry's runs together: its best run by the score, and the scores' mean, spread and range over the seeds."""
     scored = sorted((r for r in rows if r["score"] is not None), key=lambda r: r["score"])
@@ -119,35 +128,6 @@ def _entry(name: str, rows: Sequence[Mapping[str, Any]], refused: str | None) ->
         "range": [scores[0], scores[-1]] if len(scores) > 1 else None,
         "best": best and {k: best[k] for k in ("seed", "score", "score_interval", "level", "groups", "results")},
     }
-
-
-def across_seeds(scores: Mapping[str, Sequence[float]]) -> list[dict[str, Any]]:
-    """Differences of the entries' mean scores over their seeds of training, by Welch's t-test, corrected for many looks by Holm.
-
-    Args:
-        scores: of each entry's runs; an entry with fewer than two, or with the same in all, says nothing of its spread and is left out.
-
-    Returns:
-        ``first``, ``second``, ``difference`` of the second's mean minus the first's, ``p_value`` and ``corrected`` of each pair.
-    """
-    known = {name: own for name, own in scores.items() if len(set(own)) > 1}
-    pairs: list[dict[str, Any]] = []
-    for (first, one), (second, two) in combinations(known.items(), 2):
-        difference = statistics.fmean(two) - statistics.fmean(one)
-        p_value = float(ttest_ind(one, two, equal_var=False).pvalue)
-        pairs.append({"first": first, "second": second, "difference": round(difference, 6), "p_value": p_value})
-    corrected = holm([pair["p_value"] for pair in pairs])
-    return [pair | {"corrected": p} for pair, p in zip(pairs, corrected, strict=True)]
-
-
-def _seeds_sentence(pairs: Sequence[Mapping[str, Any]]) -> str:
-    """What the seeds of training allow to say about the entries themselves."""
-    real = sorted((p for p in pairs if p["corrected"] < 1.0 - CONFIDENCE), key=lambda p: p["corrected"])
-    found = f"Over the seeds of training, {len(real)} of {len(pairs)} differences are real (Welch's test, Holm's correction)"
-    shown = ", ".join(
-        f"'{p['second']}' and '{p['first']}' {p['difference']:+.4f} (p {format_p(p['corrected'])})" for p in real
-    )
-    return f"{found}: {shown}." if real else f"{found}: with so few runs the methods cannot be told apart."
 
 
 def _listed(names: Sequence[str]) -> str:
