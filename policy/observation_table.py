@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal
 
-from ..files.parsing import shown
+from ..files.parsing import did_you_mean, shown
 from ..files.plugins import load_plugin, plugins, raised
 
 if TYPE_CHECKING:
@@ -259,7 +259,8 @@ def observation(name: str) -> Observation:
     installed = plugins(GROUP)
     if name not in installed:
         names = dict.fromkeys((*OBSERVATIONS, *installed))
-        raise ObservationError(f"unknown observation term {shown(name)}; choose from: {', '.join(names)}")
+        near = did_you_mean(name, names)
+        raise ObservationError(f"unknown observation term {shown(name)}{near}; choose from: {', '.join(names)}")
     found = load_plugin(installed[name], ObservationError)
     if not isinstance(found, Observation) or found.name != name:
         raise ObservationError(

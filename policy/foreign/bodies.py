@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from typing import Any
 
-from ...files.parsing import shown
+from ...files.parsing import did_you_mean, shown
 from ...robots import Robot, load_robot, robot_names
 from ...robots.anatomy.body_plan import robot_model
 from ..base import PolicyError
@@ -34,7 +34,8 @@ def choose_robot(asked: Robot | None, named: str | None, source: object) -> Robo
     known = next((name for name in robot_names() if _bare(name) == _bare(named)), None)
     if known is None:
         raise PolicyError(
-            f"'{source}' describes a policy for robot {shown(named)}, which is not installed (there are {', '.join(robot_names())}); "
+            f"'{source}' describes a policy for robot {shown(named)}, which is not installed (there are {', '.join(robot_names())})"
+            f"{did_you_mean(named, robot_names())}; "
             "give its robot.toml with --robot ('gaitgauge robot new MODEL.xml' writes one)"
         )
     return load_robot(known)

@@ -56,6 +56,11 @@ def read_deploy(data: Mapping[str, Any], path: Path, asked: Robot | None, *, of_
 
 def _read(data: Mapping[str, Any], path: Path, robot: Robot) -> PolicyContract:
     names = sdk_joints(robot, list(data["joint_ids_map"]), path, "joint_ids_map")
+    for key in ("default_joint_pos", "stiffness", "damping"):
+        if len(data[key]) != len(names):
+            raise PolicyError(
+                f"'{path}' has {len(data[key])} values of {key}; {len(names)} are needed, one for each of joint_ids_map"
+            )
     sdk = [int(i) for i in data["joint_ids_map"]]
     default = [float(v) for v in data["default_joint_pos"]]
     actions = dict(data["actions"])

@@ -8,7 +8,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from ...files.parsing import parse_toml, read_text, shown
+from ...files.parsing import did_you_mean, parse_toml, read_text, shown
 from ...robots.base import Robot
 from ..base import PolicyError
 from ..contract import PER_ENTRY, PER_JOINT, ContractError, PolicyContract, reordered, standard_contract
@@ -53,8 +53,12 @@ def contract_of(
     joints = len(names) if isinstance(names, list) else len(usual.get("joint_names", ()))
     assumed = [str(provenance["assumed"])] if "assumed" in provenance else []
     for name in PER_JOINT:
-        if _is_number(data.get(name)):
-            data[name] = [data[name]] * joints
+        if _is_number(given := data.get(name)):
+            data[name] = [given] * joints
+        elif not isinstance(given, list | tuple | None):
+            raise PolicyError(
+                f"{source} is wrong: {name} is {shown(given)}; it must be a number, or a list with one per joint"
+            )
     limits = data.get("target_range")
     if isinstance(limits, list) and len(limits) == 2 and all(map(_is_number, limits)):
         data["target_range"] = [limits] * joints
@@ -90,6 +94,12 @@ def _usual(data: dict[str, Any], robot: Robot, preset: object, source: str) -> d
             data["history"] = {**asdict(standard.history), **history}
     else:
         raise PolicyError(f"{source}: preset is {shown(preset)}; it must be one of {', '.join(presets())}")
+    for name in names if isinstance(names, list) else ():
+        if name not in robot.joint_names:
+            raise PolicyError(
+                f"{source} is wrong: robot '{robot.name}' has no joint {shown(name)}{did_you_mean(name, robot.joint_names)}; "
+                f"it has {', '.join(robot.joint_names)}"
+            )
     if isinstance(names, list) and len(names) == robot.num_joints and all(n in names for n in robot.joint_names):
         standard = reordered(standard, names)
     return standard.to_dict()

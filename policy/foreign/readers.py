@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -118,7 +119,7 @@ def find_description(path: Path, asked: Robot | None, facts: Facts) -> PolicyCon
         PolicyError: a description is malformed or for another robot, or two of them disagree.
     """
     if (own := contract_beside(path)) is not None:
-        return read_description(own, asked, facts)
+        return _noting_others(read_description(own, asked, facts), own, path, asked, facts)
     if "contract" in facts.metadata:
         try:
             return PolicyContract.from_json(facts.metadata["contract"])
@@ -143,6 +144,22 @@ def find_description(path: Path, asked: Robot | None, facts: Facts) -> PolicyCon
     if not found and problem:
         raise problem
     return found[0][1] if found else None
+
+
+def _noting_others(
+    contract: PolicyContract, own: Path, path: Path, asked: Robot | None, facts: Facts
+) -> PolicyContract:
+    """Return the contract of ``own`` with a remark on the first other description of a policy that says otherwise: it is not used."""
+    others: list[tuple[str, Callable[[], PolicyContract | None]]] = []
+    with suppress(PolicyError):  # what is not used need not be sound
+        others = _candidates(path, asked, facts)
+    for source, read in others:
+        with suppress(PolicyError):
+            if (other := read()) is not None and (difference := _disagreement(contract, other)):
+                remark = f"{own.name} is used, and not {source}, which differs in {difference}"
+                told = "; ".join(filter(None, (contract.provenance.get("assumed"), remark)))
+                return replace(contract, provenance={**contract.provenance, "assumed": told})
+    return contract
 
 
 def _candidates(path: Path, asked: Robot | None, facts: Facts) -> list[tuple[str, Callable[[], PolicyContract | None]]]:

@@ -26,10 +26,12 @@ def checked(source: object, what: str) -> Iterator[None]:
         yield
     except ContractError as error:
         raise PolicyError(f"'{source}' does not give a valid policy contract: {error}") from error
-    except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError) as error:
+    except KeyError as error:
+        raise PolicyError(f"'{source}' lacks {error} of {what}") from error
+    except (TypeError, ValueError, IndexError, AttributeError, OverflowError) as error:
         if isinstance(error, PolicyError):
             raise
-        raise PolicyError(f"'{source}' lacks or garbles an entry of {what}: {error!r}") from error
+        raise PolicyError(f"'{source}' has a malformed entry of {what}: {error}") from error
 
 
 def listed(value: Any, missing: Any, count: int = 1) -> list[Any]:

@@ -131,6 +131,11 @@ def test_two_descriptions_that_disagree(tmp_path):
     ):
         load_policy(path)
     assert load_policy(path, contract_file=tmp_path / "params" / "deploy.yaml").contract.action_scale == (0.5,) * 12
+    (tmp_path / "contract.toml").write_text("action_scale = 0.4")
+    assert load_policy(path).contract.provenance["assumed"] == (
+        f"contract.toml is used, and not {tmp_path / 'deploy.yaml'}, which differs in the order of the joints "
+        "(FL_hip_joint, FL_thigh_joint, FL_calf_joint … and FL_hip_joint, FR_hip_joint, RL_hip_joint …)"
+    )
     (tmp_path / "strange.yaml").write_text("a: 1")
     with pytest.raises(PolicyError, match=r"is no description of a policy that is understood: contract\.toml, "):
         load_policy(path, contract_file=tmp_path / "strange.yaml")

@@ -292,7 +292,13 @@ def test_half_precision(tmp_path):
             'observation = [{ name = "last_action", values = [1.0] }]',
             "last_action has values; only constant and command do",
         ),
-        ('observation = [{ name = "joint_posision" }]', "unknown observation term 'joint_posision'"),
+        (
+            'observation = [{ name = "joint_posision" }]',
+            "unknown observation term 'joint_posision'; did you mean 'joint_position'",
+        ),
+        ('joint_names = ["FL_hip"]', "robot 'go2' has no joint 'FL_hip'; did you mean 'FL_hip_joint'"),
+        ('robot = "go3"', "is not installed (there are anymal_c, g1, go1, go2, go2w); did you mean 'go2'"),
+        ('action_scale = "big"', "action_scale is 'big'; it must be a number, or a list with one per joint"),
         ("history = { length = 5 }", "takes 45 values, but its contract's observation has 225"),
     ],
 )

@@ -209,10 +209,10 @@ def changed_term(**changes: object) -> dict:
     ("changes", "named"),
     [
         ({"joint_ids_map": [0] * 12}, "joint_ids_map"),
-        ({"stiffness": [20.0] * 3}, "deploy.yaml"),
-        ({"actions": {}}, "JointPositionAction"),
+        ({"stiffness": [20.0] * 3}, "has 3 values of stiffness; 12 are needed"),
+        ({"actions": {}}, "lacks 'JointPositionAction' of deploy.yaml"),
         ({"actions": {"JointPositionAction": {"scale": 0.25, "offset": [0.0] * 11}}}, "deploy.yaml"),
-        ({"default_joint_pos": [0.0] * 11}, "deploy.yaml"),
+        ({"default_joint_pos": [0.0] * 11}, "has 11 values of default_joint_pos"),
         ({"step_dt": "fast"}, "fast"),
         ({"step_dt": -0.02}, "control_period"),
         ({"observations": changed_term(history_length=3)}, "takes 225 values"),
@@ -245,7 +245,9 @@ def test_contract_in_the_metadata_wins_over_the_deploy_file(tmp_path, contract):
     assert load_policy(path).contract == described
     sidecar = replace(contract, control_period=0.005)
     (tmp_path / "policy.contract.json").write_text(sidecar.to_json())
-    assert load_policy(path).contract == sidecar
+    found = load_policy(path).contract
+    assert replace(found, provenance=sidecar.provenance) == sidecar
+    assert "policy.contract.json is used, and not " in found.provenance["assumed"]
 
 
 def mjlab_metadata(go2, **changes: str) -> dict[str, str]:
