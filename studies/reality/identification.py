@@ -290,7 +290,7 @@ def identify(
 
     Args:
         base: set to start from; its values are the priors' means.
-        draws: of the bootstrap over blocks of half a second, each followed by one Newton step.
+        draws: of the bootstrap over blocks of half a second and over the priors, each followed by one Newton step.
 
     Raises:
         LogError: no logs, or one of a standing robot.
@@ -406,7 +406,7 @@ def _bootstrap(
     draws: int,
     seed: int,
 ) -> Array:
-    """Return the free unknowns of each draw of whole blocks of time, one Newton step from the fit, (draws, F)."""
+    """Return the free unknowns of each draw of whole blocks of time and of the priors' means, one Newton step from the fit, (draws, F)."""
     blocks = int(problem.block.max()) + 1
     order = np.argsort(problem.block, kind="stable")
     edges = np.searchsorted(problem.block[order], np.arange(blocks + 1))
@@ -421,10 +421,11 @@ def _bootstrap(
     centre = gradients.sum(axis=0) + prior_gradient  # zero at an optimum inside the bounds
     random = np.random.default_rng(seed)
     counts = random.multinomial(blocks, np.full(blocks, 1.0 / blocks), size=draws)
+    guesses = random.normal(size=(draws, len(free))) / spreads  # where the prior decides, its spread is the uncertainty
     found = np.empty((draws, len(free)))
     for d, count in enumerate(counts):
         hessian = np.tensordot(count, hessians, axes=1) + np.diag(spreads**-2)
-        found[d] = x[free] - np.linalg.solve(hessian, count @ gradients + prior_gradient - centre)
+        found[d] = x[free] - np.linalg.solve(hessian, count @ gradients + prior_gradient - centre + guesses[d])
     return found
 
 
