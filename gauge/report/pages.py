@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections.abc import Callable
 from functools import cache
@@ -9,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import jinja2
+from markupsafe import Markup
 
 from ...files.parsing import edited, read_results
 from ...files.writing import write_atomically
@@ -23,7 +25,7 @@ def page_template(module: str, name: str, **filters: Callable[..., object]) -> j
         module: ``__file__`` of the caller; its folder ``templates/`` is searched first, then the one beside this module, which
             holds the style sheet and the charts of all pages.
         name: file in one of these folders.
-        filters: functions of a module that the template calls by these names, beside ``fixed``.
+        filters: functions of a module that the template calls by these names, beside ``fixed`` and ``labelled``.
     """
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader([Path(file).parent / "templates" for file in (module, __file__)]),
@@ -33,7 +35,7 @@ def page_template(module: str, name: str, **filters: Callable[..., object]) -> j
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"fixed": fixed} | filters
+    environment.filters |= {"fixed": fixed, "labelled": labelled} | filters
     return environment.get_template(name)
 
 
@@ -73,3 +75,36 @@ def page_of(source: Path, name: str, render: Callable[[dict[str, Any]], str], *,
 def fixed(value: float | None, digits: int = 4) -> str:
     """A number with fixed decimals; a dash for what does not exist."""
     return "–" if value is None else f"{value:.{digits}f}".replace("-", "−")
+
+
+_STACKED = re.compile(r'(<table class="[^"]*\bstack\b[^"]*">\s*<thead>)(.*?)(</thead>.*?</table>)', re.DOTALL)
+_ROW, _HEAD, _TAG = (
+    re.compile(r"<tr\b.*?</tr>", re.DOTALL),
+    re.compile(r"<th\b[^>]*>(.*?)</th>", re.DOTALL),
+    re.compile(r"<[^>]*>"),
+)
+_CELL = re.compile(r"<td\b([^>]*)>")
+
+
+def labelled(page: str) -> Markup:
+    """Return markup in which the cells of tables of class ``stack`` carry their column's head, which narrow screens show in each row.
+
+    The first cell of a row is its name, charts need no label, and a cell may have a label of its own.
+    """
+    return Markup(_STACKED.sub(_with_labels, page))
+
+
+def _with_labels(table: re.Match[str]) -> str:
+    heads = [" ".join(_TAG.sub("", head).split()) for head in _HEAD.findall(table[2])]
+
+    def row(found: re.Match[str]) -> str:
+        column = itertools.count()
+
+        def cell(found: re.Match[str]) -> str:
+            i = next(column)
+            name = heads[i] if 0 < i < len(heads) and "data-label" not in found[1] and "strip" not in found[1] else ""
+            return f'<td data-label="{name}"{found[1]}>' if name else found[0]
+
+        return _CELL.sub(cell, found[0])
+
+    return table[1] + table[2] + _ROW.sub(row, table[3])

@@ -9,7 +9,8 @@ import pytest
 from gaitgauge.api import ResultsError, load_results
 from gaitgauge.gauge.coverage import notes
 from gaitgauge.gauge.report.page import CLIP, FELL_AT_LIMIT, metric_matrix, render, sources, warnings, write_report
-from gaitgauge.gauge.result import Health, Statistics
+from gaitgauge.gauge.report.pages import labelled
+from gaitgauge.gauge.result import Health, Run, Statistics
 from gaitgauge.gauge.store import StoreError
 from gaitgauge.studies.compare.comparison import ComparisonError, compare, load_result
 from sample_results import HOSTILE, PIPELINES, Page, read, row, sample
@@ -145,6 +146,27 @@ def test_directions_commands_and_references_are_shown(stress):
         assert words in page.text
     assert "for comparison: others" in page.text
     assert "for comparison: others" not in Page(render(sample("base", **PIPELINES["base"]))).text
+
+
+def test_commands_of_a_suite_s_own_have_no_table_of_directions(stress):
+    """The page of the suite toy had an empty one."""
+    runs = {0: Run(columns={"quality": 0.5}, commands={"ahead 1": 0.8})}
+    text = Page(render(replace(stress, environments=tuple(replace(r, runs=runs) for r in stress.environments)))).text
+    assert "By command" in text and "By direction" not in text
+
+
+def test_cells_of_stacked_tables_carry_the_heads_of_their_columns():
+    """At 390 pixels the page of consistency showed no gap, and of the models' values none."""
+    head = '<thead><tr><th>engine</th><th>gap &lt; [m]</th><th class="strip"><svg><text>0.5</text></svg></th><th>end</th></tr></thead>'
+    rows = (
+        '<tr><td>a</td><td class="x">1</td><td class="strip"></td><td data-label="own">2</td></tr><tr><td>b</td></tr>'
+    )
+    plain = f"<table>{head}{rows}</table>"
+    assert labelled(plain) == plain
+    found = labelled(f'<table class="stack one">\n{head}{rows}</table>{plain}')
+    assert found == f'<table class="stack one">\n{head}{rows}</table>{plain}'.replace(
+        '<td class="x">', '<td data-label="gap &lt; [m]" class="x">', 1
+    )
 
 
 def test_warnings_come_after_the_score_and_in_proportion(stress):
