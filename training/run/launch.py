@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
-from datetime import datetime
+from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -86,7 +86,7 @@ def train(
                 elif plan.weights is not None:
                     begin_with(runner, plan.weights)
                 if run is not None:  # a run that anything above refuses is left as it was
-                    _describe(plan, run, env)
+                    _describe(plan, run, env, began)
                 limit = plan.request.seconds
                 seconds = None if limit is None else max(limit - (time.monotonic() - began), 0.0)
                 outcome = runner.learn(run_settings.iterations - runner.iteration, max_seconds=seconds)
@@ -213,15 +213,17 @@ def _remove_unused(run: Path) -> None:
         shutil.rmtree(run, ignore_errors=True)
 
 
-def _describe(plan: TrainPlan, run: Path, env: TrainingEnvironment) -> None:
-    """Write the run's parameters and ``run.json``; a resume is noted there."""
+def _describe(plan: TrainPlan, run: Path, env: TrainingEnvironment, began: float) -> None:
+    """Write the run's parameters and ``run.json``; a resume is noted there. ``began`` is ``time.monotonic()`` of the command's start."""
     task = plan.task
+    start = datetime.now().astimezone() - timedelta(seconds=time.monotonic() - began)
     write_parameters(run, environment=task.environment, agent=task.training)
     description = {
         "task": task.name,
         "backend": plan.backend,
         "num_envs": task.environment.num_envs,
         "seed": task.training.run.seed,
+        "began": start.isoformat(timespec="seconds"),
         "started": f"{datetime.now().astimezone():%Y-%m-%dT%H:%M:%S%z}",
         "contract_hash": env.contract.hash,
         **provenance(command=sys.argv, device=plan.device),
@@ -230,7 +232,7 @@ def _describe(plan: TrainPlan, run: Path, env: TrainingEnvironment) -> None:
     if earlier := read_run_json(run):
         checkpoint = plan.checkpoint.name if plan.checkpoint else ""
         note = {"started": description["started"], "checkpoint": checkpoint, "command": description["command"]}
-        description = {k: v for k, v in description.items() if k not in ("started", "date", "command")}
+        description = {k: v for k, v in description.items() if k not in ("began", "started", "date", "command")}
         update_run_json(run, description | {"resumed": [*earlier.get("resumed", []), note]})
         return
     shipped = plan.request.init_from in shipped_policies()  # known by its name wherever it is installed
