@@ -183,6 +183,8 @@ class Scenario:
     """Sliding friction coefficient of every contact."""
     repeats: Annotated[int, Field(ge=1, le=1000)] = 20
     """Robots, where no other number is asked for."""
+    legs: Annotated[int, Field(ge=1, le=100)] | None = None
+    """Number of legs of the robots that ``all`` sends through it; None: any. By its name a scenario takes every robot."""
     suite: Text = "gaitgauge-1"
     """Suite of the physics, sensor noise and latency."""
     torque_speed_limit: bool = True
@@ -208,7 +210,7 @@ class Scenario:
     @property
     def digest(self) -> str:
         """SHA-256 over all that decides about outcomes, hexadecimal."""
-        words = ("title", "about", "repeats", "reported")
+        words = ("title", "about", "repeats", "legs", "reported")
         rules = {k: v for k, v in asdict(self).items() if k not in words and (k not in _LATER or v not in ((), None))}
         rules |= {"suite": load_suite(self.suite).digest}
         return hashlib.sha256(json.dumps(rules, sort_keys=True).encode()).hexdigest()

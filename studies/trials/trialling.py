@@ -22,6 +22,7 @@ from ...gauge.suite import SuiteError
 from ...policy.base import Policy, PolicyError
 from ...policy.contract import ContractError, PolicyContract
 from ...robots import RobotError
+from ...robots.anatomy.roles import anatomy
 from ..policies import describe, load_policies
 from ..turns import Turns, Watch
 from .page import render_page
@@ -52,6 +53,7 @@ def run_trials(
         request.policies, request.robot, trust=request.trust, contract_file=request.contract
     )
     scenarios: dict[str, Scenario] = {}
+    named: set[str] = set()
     names = [n for name in request.scenarios or (ALL,) for n in (scenario_names() if name == ALL else [name])]
     for name in dict.fromkeys(names):
         try:
@@ -60,11 +62,14 @@ def run_trials(
                 called = f"'{name}' is called '{scenario.name}' as another one of these scenarios"
                 raise ScenarioError(f"{called}; rename it")
             scenarios[scenario.name] = scenario
+            named |= {scenario.name} if name in request.scenarios else set()
         except ScenarioError as error:
             refused.append({"what": name, "reason": str(error)})
     where: dict[str, Any] = {"backend": request.backend, "device": device, "threads": cpu_threads(request.threads)}
-    entries = [_about(scenario) for scenario in scenarios.values()]
-    turns = [(s, e, label) for s, e in zip(scenarios.values(), entries, strict=True) for label in policies]
+    legs = {label: len(anatomy(each.robot).legs) for label, each in policies.items()}
+    fits = {name: [p for p in policies if name in named or s.legs in (None, legs[p])] for name, s in scenarios.items()}
+    entries = [_about(scenario) for name, scenario in scenarios.items() if fits[name]]
+    turns = [(scenarios[entry["name"]], entry, label) for entry in entries for label in fits[entry["name"]]]
     repeats = [request.repeats or scenario.repeats for scenario, *_ in turns]
     told = Turns(
         watch, [Stage(s.name, s.seconds * (_LOOP + n), s.name) for (s, *_), n in zip(turns, repeats, strict=True)]

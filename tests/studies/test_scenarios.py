@@ -6,7 +6,10 @@ from dataclasses import asdict, replace
 
 import pytest
 from gaitgauge.gauge.suite import load_suite
+from gaitgauge.policy.base import PolicyError
+from gaitgauge.studies.trials import trialling
 from gaitgauge.studies.trials.page import speeds, view
+from gaitgauge.studies.trials.request import TrialRequest
 from gaitgauge.studies.trials.scenario import Payload, ScenarioError, load_scenario, scenario_names, scenario_text
 from gaitgauge.studies.trials.trialling import profile
 
@@ -72,7 +75,7 @@ def test_a_scenario_differs_in_its_digest_by_what_decides_about_outcomes_alone(t
 def test_fields_that_came_later_leave_digests_as_they_were(tmp_path):
     """The digest as it was before there were patches, payloads and latencies."""
     sprint = load_scenario("sprint")
-    words = ("title", "about", "repeats", "reported", "patches", "payload", "latency")
+    words = ("title", "about", "repeats", "legs", "reported", "patches", "payload", "latency")
     rules = {k: v for k, v in asdict(sprint).items() if k not in words} | {"suite": load_suite(sprint.suite).digest}
     assert sprint.digest == hashlib.sha256(json.dumps(rules, sort_keys=True).encode()).hexdigest()
     own = load(tmp_path, OWN)
@@ -261,3 +264,18 @@ def test_a_sprint_is_drawn_as_speed_over_time_with_the_speed_to_reach():
     (early, fast), (late, slow) = way["points"]
     assert drawn["kind"] == "speed" and early < late and fast < drawn["wanted"] < slow
     assert [t["text"] for t in drawn["values"]][::2] == ["0", "1", "2", "3", "4", "5"]
+
+
+@pytest.mark.parametrize(("asked", "tried"), [((), 4), (("all", "low-steps"), 4), (("shoves",), None)])
+def test_all_sends_a_robot_through_the_scenarios_for_its_number_of_legs(asked, tried, monkeypatch, tmp_path):
+    def refuse(policy, robot, scenario, *_, **__):
+        played.append(scenario.name)
+        raise PolicyError("no")
+
+    played = []
+    monkeypatch.setattr(trialling, "run_scenario", refuse)
+    with pytest.raises(ScenarioError, match="no"):
+        trialling.run_trials(TrialRequest(policies=("pretrained",), scenarios=asked), tmp_path)
+    fitting = {name for name in scenario_names() if load_scenario(name).legs in (None, tried) and tried}
+    assert set(played) == fitting | {name for name in asked if name != "all"}
+    assert load_scenario("shoves").legs == load_scenario("low-steps").legs == 2
