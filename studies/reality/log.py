@@ -237,15 +237,45 @@ def inverse_torque(robot: Robot, position: Array) -> Array:
     """Return the torque with which each joint of free legs under an upright, fixed trunk rests at a pose [N·m], (J,)."""
     import mujoco
 
+    model, data = _posed(robot, position)
+    mujoco.mj_inverse(model, data)
+    return np.array([data.qfrc_inverse[model.joint(joint).dofadr[0]] for joint in robot.joint_names])
+
+
+def carried_share(robot: Robot, position: Array, torque: Array) -> float:
+    """Return the share of a robot's weight that its feet carry if its joints hold such torques beyond those of free legs.
+
+    Args:
+        position: of the joints under an upright trunk [rad], (J,).
+        torque: [N·m], (J,).
+    """
+    import mujoco
+
+    model, data = _posed(robot, position)
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    columns = [int(model.joint(joint).dofadr[0]) for joint in robot.joint_names]
+    rows = np.zeros((3 * len(robot.foot_geoms), len(columns)))
+    for i, foot in enumerate(robot.foot_geoms):
+        jacobian = np.zeros((3, model.nv))
+        geom = model.geom(foot).id
+        mujoco.mj_jac(model, data, jacobian, None, data.geom_xpos[geom], int(model.geom_bodyid[geom]))
+        rows[3 * i : 3 * i + 3] = jacobian[:, columns]
+    forces = np.linalg.lstsq(-rows.T, torque, rcond=1e-3)[0]  # of the ground on the feet
+    return float(forces[2::3].sum() / (model.body_mass.sum() * -model.opt.gravity[2]))
+
+
+def _posed(robot: Robot, position: Array) -> tuple[Any, Any]:
+    """Return a robot's model without contacts and friction, and its data at a pose."""
+    import mujoco
+
     model = mujoco.MjModel.from_xml_path(str(robot.mjcf))
     model.dof_frictionloss[:] = 0.0
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT.value
     data = mujoco.MjData(model)
-    joints = [model.joint(name) for name in robot.joint_names]
-    for joint, angle in zip(joints, position, strict=True):
-        data.qpos[joint.qposadr[0]] = angle
-    mujoco.mj_inverse(model, data)
-    return np.array([data.qfrc_inverse[joint.dofadr[0]] for joint in joints])
+    for joint, angle in zip(robot.joint_names, position, strict=True):
+        data.qpos[model.joint(joint).qposadr[0]] = angle
+    return model, data
 
 
 def save_log(log: Log, path: Any) -> None:

@@ -18,7 +18,7 @@ from ...gauge.play.remaining import Stage
 from ...robots import JointParameters
 from ...robots.sets import find_set, joint_groups
 from ..turns import Turns, Watch
-from .log import Log, LogError, inverse_torque
+from .log import Log, LogError, carried_share, inverse_torque
 from .page import render_page, traces
 from .readers import read_log, read_map
 from .request import LogOptions, ReplayRequest
@@ -27,6 +27,8 @@ from .rig import FixedRig, Motion, acting_parameters, at_rows, beginning, held_t
 
 LONGEST_DELAY = 0.03
 """Largest delay that is fitted [s]."""
+_CARRIED = 0.4
+"""Largest share of a robot's weight that friction and offsets of a hung robot's joints can look like."""
 
 
 def read_logs(paths: Sequence[Path], options: LogOptions) -> list[Log]:
@@ -68,10 +70,16 @@ def _check_hung(log: Log) -> None:
         raise LogError(
             f"log '{log.name}' is replayed as hung, but its trunk turns at {turning:.1f} rad/s; it looks like a walking robot's"
         )
-    error = log.target - log.position
-    asked = np.median(log.stiffness * error, axis=0)
-    free = inverse_torque(log.robot, np.median(log.position, axis=0))
-    beyond = np.abs(asked - free)
+    pose, error = np.median(log.position, axis=0), log.target - log.position
+    speed = log.velocity if log.velocity is not None else np.gradient(log.position, log.time, axis=0)
+    free = inverse_torque(log.robot, pose)
+    carried = carried_share(log.robot, pose, (log.stiffness * error - log.damping * speed).mean(axis=0) - free)
+    if carried > _CARRIED:
+        raise LogError(
+            f"log '{log.name}' is replayed as hung, but its legs carry {carried:.0%} of the robot's weight; it looks like a robot "
+            "on its feet (--held standing where it stood), or the gains in the log are not those that were sent"
+        )
+    beyond = np.abs(np.median(log.stiffness * error, axis=0) - free)
     group, joints = max(joint_groups(log.robot).items(), key=lambda item: float(beyond[item[1]].mean()))
     limit = 0.15 * np.asarray(log.robot.parameters[log.robot.default_parameters].torque_limit)[joints].mean()
     if (most := float(beyond[joints].mean())) > limit:

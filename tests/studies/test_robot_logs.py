@@ -5,11 +5,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
+from gaitgauge.backends.base import PhysicsOptions, Scene
+from gaitgauge.backends.registry import make_backend
 from gaitgauge.robots import load_robot
 from gaitgauge.studies.reality.chirp import Chirp, simulated_log
-from gaitgauge.studies.reality.log import LogError, save_log
+from gaitgauge.studies.reality.log import LogError, carried_share, inverse_torque, save_log
 from gaitgauge.studies.reality.readers import LogMap, read_log, read_map
 from gaitgauge.studies.reality.replaying import check_torque, hung_or_standing
+from gaitgauge.terrains.registry import make_terrain
 
 GO2 = load_robot("go2", check=False)
 ORDER = tuple(reversed(GO2.joint_names))
@@ -199,13 +203,31 @@ def test_files_that_are_no_logs_are_refused(tmp_path):
 
 def test_a_robot_on_its_feet_is_not_replayed_as_hung(log):
     loaded = replace(log, position=log.position + np.where(np.arange(12) % 3 == 2, -0.4, 0.0))
-    with pytest.raises(LogError, match=r"calf motors hold .* like a robot on its feet"):
+    with pytest.raises(LogError, match=r"legs carry \d+% of the robot's weight; it looks like a robot on its feet"):
         hung_or_standing(loaded)
+    with pytest.raises(LogError, match=r"hip motors hold .* or the gains in the log are not those that were sent"):
+        hung_or_standing(replace(log, stiffness=4 * log.stiffness))
     turning = replace(log, angular_velocity=np.full((len(log.time), 3), 0.6))
     with pytest.raises(LogError, match="looks like a walking robot's"):
         hung_or_standing(turning)
     with pytest.raises(LogError, match="is of a walking robot"):
         hung_or_standing(replace(log, held="walking"))
+
+
+def test_legs_of_a_standing_robot_carry_its_weight():
+    robot, physics = GO2, PhysicsOptions(timestep=0.002, substeps=10)
+    terrains = (make_terrain("flat", None),)
+    scene = Scene(
+        robot=robot, parameters=GO2.parameters["gauge"], terrains=terrains, terrain_index=(0,), physics=physics
+    )
+    engine = make_backend("mujoco", scene)
+    engine.reset(engine.standing())
+    for _ in range(75):
+        engine.step(torch.tensor([robot.default_joint_position], dtype=engine.dtype))
+    position, torque = engine.state.joint_position[0].numpy(), engine.state.joint_torque[0].numpy()
+    share = carried_share(robot, position, torque - inverse_torque(robot, position))
+    assert share == pytest.approx(1.0, abs=0.1)
+    assert abs(carried_share(robot, position, np.zeros(12))) < 1e-9
 
 
 def test_gains_that_the_torques_contradict_are_refused(log):
