@@ -12,13 +12,13 @@ import typer
 from rich.text import Text
 
 from ..studies.jury.page import write_page
-from ..studies.jury.request import JuryRequest, JuryStatus
+from ..studies.jury.request import JuryCost, JuryRequest, JuryStatus
 from ..studies.jury.study import jury, prepare_jury
 from ..studies.jury.verdict import OFF, command_words
 from ..studies.naming import free_run_folder, joined_names
 from .console import Terminal, make_table
 from .policies import policy_files
-from .progress import ProgressDisplay
+from .progress import ProgressDisplay, duration
 from .studies import resumable, show_results
 
 
@@ -34,7 +34,14 @@ def run_jury(request: JuryRequest, engines: str, *, out: Path | None, resume: bo
         console.say(f"{engine['engine']} does not judge: {engine['reason']}")
     with resumable(console, "judging", folder, "--resume") as display:
         command = ["gaitgauge", *sys.argv[1:]]
-        results = jury(prepared, folder, resume=resume, command=command, watch=lambda s: _show(display, s))
+        results = jury(
+            prepared,
+            folder,
+            resume=resume,
+            command=command,
+            watch=lambda s: _show(display, s),
+            told=lambda c: _tell(console, c),
+        )
         page = write_page(folder)
     show_results(results, print_jury, folder / "jury.json", page, json_output=json_output)
     unable = {engine["engine"]: engine["reason"] for block in results["policies"] for engine in block["unable"]}
@@ -42,6 +49,15 @@ def run_jury(request: JuryRequest, engines: str, *, out: Path | None, resume: bo
         console.say(f"{name} did not play to the end: {reason}")
     if unable:
         raise typer.Exit(1)
+
+
+def _tell(console: Terminal, cost: JuryCost) -> None:
+    """Print what is played, and how long that takes."""
+    count = f" for each of {cost.policies} policies" * (cost.policies > 1)
+    console.say(
+        f"{cost.engines} engines play {cost.episodes} episodes{count}, at most {cost.world_steps:,} steps of one world in each; "
+        f"that takes about {duration(cost.seconds)}"
+    )
 
 
 def _show(display: ProgressDisplay, status: JuryStatus) -> None:

@@ -60,6 +60,20 @@ class JuryRequest:
 
 
 @dataclass(frozen=True, kw_only=True)
+class JuryCost:
+    """What a jury plays, said before it begins."""
+
+    episodes: int
+    """In each engine, of each policy."""
+    world_steps: int
+    """Physics steps of one world in these episodes, at most."""
+    engines: int
+    policies: int
+    seconds: float
+    """Of all engines and policies, estimated."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class JuryStatus:
     """How far a jury is, for the progress display."""
 

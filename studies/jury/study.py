@@ -33,7 +33,7 @@ from ..consistency.variants import Variant, parse_variant, place
 from ..engine_pace import EnginePace, measure_all, measure_cost
 from ..naming import folder_name
 from ..policies import Loaded, describe, load_policies
-from .request import ENGINES, PARTS, JuryError, JuryRequest, JuryStatus
+from .request import ENGINES, PARTS, JuryCost, JuryError, JuryRequest, JuryStatus
 from .verdict import Bench, sentences, verdict
 
 SCHEMA = 1
@@ -58,6 +58,13 @@ class PreparedJury:
     def families(self) -> dict[str, str]:
         """Return the family of each engine."""
         return {v.label: engine_class(v.backend).family or v.backend for v in self.engines}
+
+    @property
+    def world_steps(self) -> int:
+        """Return the physics steps of one world that all episodes of an engine take at most."""
+        suite, phases = self.suite, [row for goal in self.suite.goals for row in goal.sub_commands]
+        seconds = sum(phase.seconds for row in phases for phase in row) + len(phases) * suite.settling.longest
+        return len(self.bench.episodes()) * round(seconds / suite.physics.timestep)
 
     def home(self, label: str) -> Path:
         """Return the folder of a policy within the jury's."""
@@ -147,10 +154,11 @@ def jury(
     resume: bool = False,
     command: Sequence[str] = (),
     watch: Watch = lambda _: None,
+    told: Callable[[JuryCost], None] = lambda _: None,
 ) -> dict[str, Any]:
     """Judge policies; every finished episode is on disk at once. An engine that fails is named, and the others judge on.
 
-    Returns the content of ``jury.json`` (docs/guides/jury.md).
+    ``told`` hears what it takes before anything is played. Returns the content of ``jury.json`` (docs/guides/jury.md).
 
     Raises:
         JuryError: not one engine played to the end.
@@ -159,7 +167,7 @@ def jury(
     began = time.perf_counter()
     prepared = request if isinstance(request, PreparedJury) else prepare_jury(request)
     torch.set_num_threads(1)  # several would change the last bits of the policy's output
-    session = _Session(prepared, folder, resume=resume, watch=watch)
+    session = _Session(prepared, folder, resume=resume, watch=watch, told=told)
     blocks = [session.judge(label, loaded) for label, loaded in prepared.policies.items()]
     results: dict[str, Any] = {
         "schema": SCHEMA,
@@ -192,8 +200,10 @@ def jury(
 class _Session:
     """One jury at work."""
 
-    def __init__(self, prepared: PreparedJury, folder: Path, *, resume: bool, watch: Watch) -> None:
-        self._prepared, self._folder, self._resume, self._watch = prepared, folder, resume, watch
+    def __init__(
+        self, prepared: PreparedJury, folder: Path, *, resume: bool, watch: Watch, told: Callable[[JuryCost], None]
+    ) -> None:
+        self._prepared, self._folder, self._resume, self._watch, self._told = prepared, folder, resume, watch, told
         self._episodes = prepared.bench.episodes()
         self._threads = cpu_threads(prepared.request.threads)
         self._unable: dict[str, str] = {}
@@ -285,7 +295,16 @@ class _Session:
 
         costs = measure_all(engines, one, lambda v, error: self._unable.update({v.label: str(error)}))
         runs = [v for _ in prepared.policies for v in engines]
-        return EnginePace(runs, costs, self._episodes, suite=prepared.suite, threads=self._threads)
+        pace = EnginePace(runs, costs, self._episodes, suite=prepared.suite, threads=self._threads)
+        cost = JuryCost(
+            episodes=len(self._episodes),
+            world_steps=prepared.world_steps,
+            engines=len(engines),
+            policies=len(prepared.policies),
+            seconds=pace.seconds_left,
+        )
+        self._told(cost)
+        return pace
 
 
 def _family(name: str) -> str:

@@ -210,14 +210,23 @@ def test_equal_engines_have_no_advantage(bench):
 
 
 def test_parts_fit_the_suite():
-    """The default part is small enough for every engine: at most 150,000 physics steps of one world."""
     for part in PARTS.values():
         suite = load_suite(part.suite)
         assert all((level == 0) == (terrain == "flat") for terrain, level in part.grounds)
         assert all(0 <= level <= suite.scoring.levels for _, level in part.grounds)
-    part = asked.PARTS["short"]
-    suite = load_suite(part.suite)
-    seconds = sum(phase.seconds for row in suite.goal("single").sub_commands for phase in row)
-    settling = suite.settling.longest * len(suite.goal("single").sub_commands)
-    steps = (seconds + settling) / suite.physics.timestep * len(part.grounds) * len(part.frictions) * part.seeds
-    assert steps <= 150_000
+
+
+def test_what_a_jury_takes_is_said_first_and_the_default_is_small(brief, tmp_path):
+    heard = []
+    told = lambda cost: heard.append((cost, (tmp_path / "out" / "fake").exists()))  # noqa: E731
+    judged(brief, tmp_path / "out", told=told)
+    ((cost, began),) = heard
+    assert not began
+    # two commands of 0.2 s and twice 0.04 s to settle, in steps of 2 ms; two grounds, two seeds
+    assert (cost.engines, cost.policies, cost.episodes, cost.world_steps) == (2, 1, 4, 4 * 240)
+    assert cost.seconds > 0.0
+
+
+def test_the_default_part_is_at_most_150_000_steps_of_one_world(brief, monkeypatch):
+    monkeypatch.setattr(judging, "PARTS", asked.PARTS)
+    assert judging.prepare_jury(brief).world_steps <= 150_000
