@@ -109,7 +109,8 @@ def _return(name: str) -> float | None:
             with zipfile.ZipFile(ROOT / "docs" / "data" / "sweeps" / f"{sweep}.zip") as archive:
                 text = archive.read(f"runs/{method}/seed-{seed}/kept/curves.csv").decode()
             rows = [line.split(",") for line in text.splitlines()]
-            return [float(row[2]) for row in rows if row[0] == "mean reward"][-1]
+            rewards = [float(row[2]) for row in rows if row[0] == "mean reward"]
+            return rewards[-1] if rewards else None
     return None
 
 

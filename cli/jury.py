@@ -53,11 +53,10 @@ def run_jury(request: JuryRequest, engines: str, *, out: Path | None, resume: bo
 
 def _tell(console: Terminal, cost: JuryCost) -> None:
     """Print what is played, and how long that takes."""
-    count = f" for each of {cost.policies} policies" * (cost.policies > 1)
-    console.say(
-        f"{cost.engines} engines play {cost.episodes} episodes{count}, at most {cost.world_steps:,} steps of one world in each; "
-        f"that takes about {duration(cost.seconds)}"
-    )
+    engines = f"{cost.engines} engines play" if cost.engines > 1 else "one engine plays"
+    policies = f" for each of {cost.policies} policies" * (cost.policies > 1)
+    steps = f"{cost.episodes} episodes{policies}, at most {cost.world_steps:,} steps of one world in each engine"
+    console.say(f"{engines} {steps}; that takes about {duration(cost.seconds)}")
 
 
 def _show(display: ProgressDisplay, status: JuryStatus) -> None:

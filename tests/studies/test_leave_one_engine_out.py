@@ -43,3 +43,10 @@ def test_a_jury_that_sees_the_truth_beats_a_judge_that_guesses(monkeypatch):
     assert rows["drake", "newton: score"] == 1.0
     assert rows["drake", "mujoco: score"] < 0.5
     assert not any(f"{h}: score" == p for h, p in rows)  # no predictor knows what is hidden
+
+
+def test_returns_of_training_are_none_where_no_curve_holds_them():
+    """A curve without a row ended ``collect``."""
+    assert study._return("baselines-CTS-seed-1") is None
+    assert study._return("baselines-CTS-seed-0") > 0.0
+    assert study._return("published-cts") is None
