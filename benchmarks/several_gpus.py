@@ -20,6 +20,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from gaitgauge.training.environment.stretches import first_alone
+from gaitgauge.training.tasks import find_task
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 KEYS = {"speed": "Perf/total_fps", "collection": "Perf/collection_time", "learning": "Perf/learning_time"}
@@ -41,6 +43,7 @@ def measure(count: int, options: argparse.Namespace) -> dict[str, float]:
         command = [sys.executable, *launcher, "-m", "gaitgauge.cli.main", "train", options.task, "--no-score"]
         command += ["--device", options.device, "--backend", options.backend, "--num-envs", str(options.num_envs)]
         command += ["--iterations", str(options.iterations), "--log-root", logs, "training.run.keep_episodes=false"]
+        command += first_alone(find_task(options.task).environment)
         command += [] if options.fuse is None else ["--fuse" if options.fuse else "--no-fuse"]
         done = subprocess.run(
             [*command, *options.settings], env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT

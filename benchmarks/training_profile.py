@@ -28,11 +28,13 @@ from typing import Any
 import environment_throughput
 import torch
 import warp_profile
+from gaitgauge.training.environment.stretches import first_alone
 from gaitgauge.training.run.launch import train
 from gaitgauge.training.run.plan import prepare
 from gaitgauge.training.run.request import TrainRequest
 from gaitgauge.training.run.runner import TrainingRunner
 from gaitgauge.training.run.stopping import Progress
+from gaitgauge.training.tasks import find_task
 from torch.profiler import ProfilerActivity, profile, record_function
 
 PARTS = (
@@ -177,7 +179,11 @@ def main() -> None:
             device=options.device,
             num_envs=options.num_envs,
             iterations=options.skip + options.iterations,
-            overrides=["training.run.keep_episodes=false", *options.settings],
+            overrides=(
+                "training.run.keep_episodes=false",
+                *first_alone(find_task(options.task).environment),
+                *options.settings,
+            ),
             init_from=options.init_from,
             log_root=Path(folder),
             fuse=options.fuse,

@@ -5,10 +5,12 @@ from unittest.mock import patch
 
 import pytest
 import torch
+from gaitgauge.robots import load_robot
 from gaitgauge.training.configuration import ConfigurationError
 from gaitgauge.training.environment import environment as environment_module
 from gaitgauge.training.environment.configuration import EnvironmentConfiguration, ScheduleConfiguration, Stretch
-from gaitgauge.training.environment.stretches import settings_in
+from gaitgauge.training.environment.policy_interface import joint_parameters, training_contract
+from gaitgauge.training.environment.stretches import check_stretches, settings_in
 from gaitgauge.training.run.checkpoint import read_checkpoint
 from gaitgauge.training.run.resuming import resume_run
 from gaitgauge.training.run.runner import TrainingRunner
@@ -81,6 +83,20 @@ def test_levels_and_the_schedule_go_on_in_the_next_stretch(tmp_path):
     assert env.next_stretch() == LAST and not env.stretch_ends
     assert env.parts.memory.level.tolist() == [0, 1, 2] * 4
     assert float(env.progress) == 0.5 and env.common_step_counter == 4
+
+
+def test_a_run_from_a_finished_policy_begins_in_the_last_stretch():
+    env = make(num_envs=2, schedule=ScheduleConfiguration(begin=1.0, stretches=(LAST,)))
+    assert env.stretch == 1 and not env.stretch_ends
+
+
+@pytest.mark.parametrize("robot", ["go1", "anymal_c"])
+def test_the_last_stretch_fits_other_robots(robot):
+    settings = find_task("rough", robot=robot).environment
+    whole = load_robot(robot)
+    contract = training_contract(whole, joint_parameters(whole, settings), settings)
+    check_stretches(settings, whole, contract)
+    assert settings_in(settings, 1).randomization.foot_torsion == (0.0, 1.0)
 
 
 @pytest.mark.parametrize("stop", [2, pytest.param(3, marks=pytest.mark.slow), pytest.param(1, marks=pytest.mark.slow)])

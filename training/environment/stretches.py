@@ -80,6 +80,11 @@ def check_stretches(configuration: EnvironmentConfiguration, robot: Robot, contr
             )
 
 
+def first_alone(configuration: EnvironmentConfiguration) -> list[str]:
+    """Return overrides that leave the stretches out, for measurements of a few iterations."""
+    return [f"environment.schedule.stretches.{each.name}.begin=1" for each in configuration.schedule.stretches]
+
+
 def without(configuration: EnvironmentConfiguration, keys: set[str]) -> EnvironmentConfiguration:
     """Return the configuration with stretches that leave some settings as they are, by key: those that a command gives hold throughout."""
     schedule = configuration.schedule
