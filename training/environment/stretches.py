@@ -11,7 +11,6 @@ from ...robots.base import Robot
 from ..configuration import ConfigurationError
 from ..overrides import apply_overrides
 from .configuration import EnvironmentConfiguration, ScheduleConfiguration
-from .policy_interface import joint_parameters, training_contract
 
 CHANGEABLE = ("commands", "physics", "push", "randomization", "reset", "rewards", "termination", "terrain")
 """Groups of ``environment`` with settings that a stretch may change; the others belong to the networks or to the whole run."""
@@ -56,6 +55,8 @@ def check_stretches(configuration: EnvironmentConfiguration, robot: Robot, contr
     """Refuse settings of any stretch that make no sense, and those that do not fit ``contract``, the policy of the whole run. Raises
     ConfigurationError, TaskError: one sentence.
     """
+    from .policy_interface import joint_parameters, training_contract  # loads torch, which a refusal must not wait for
+
     for number in range(len(configuration.schedule.stretches) + 1):
         settings = settings_in(configuration, number)
         slow, fast = settings.randomization.motor_speed
