@@ -5,8 +5,10 @@ import shutil
 from dataclasses import replace
 
 import pytest
+from gaitgauge.cli.main import app
 from gaitgauge.policy.native import save_policy
 from tiny_suite import SUITE
+from typer.testing import CliRunner
 
 
 @pytest.fixture
@@ -14,6 +16,20 @@ def tiny(tmp_path):
     path = tmp_path / "tiny.toml"
     path.write_text(SUITE.replace("[0.6, 0.9]", "[0.6]"))
     return path
+
+
+@pytest.fixture(scope="module")
+def evaluated(tmp_path_factory, contract, stored):
+    """The folder of an evaluation on the suite of ``tiny``."""
+    folder = tmp_path_factory.mktemp("evaluated")
+    (folder / "tiny.toml").write_text(SUITE.replace("[0.6, 0.9]", "[0.6]"))
+    save_policy(folder / "standing.gauge.pt", contract, stored)
+    names = [str(folder / name) for name in ("standing.gauge.pt", "tiny.toml", "first")]
+    done = CliRunner().invoke(
+        app, ["evaluate", names[0], "--suite", names[1], "--out", names[2], "--threads", "1", "--no-clip"]
+    )
+    assert done.exit_code == 0, done.output
+    return folder / "first"
 
 
 def test_policies_and_results_side_by_side(run, tmp_path, policy, tiny):
@@ -36,15 +52,13 @@ def test_policies_and_results_side_by_side(run, tmp_path, policy, tiny):
     assert {p: p.stat().st_mtime_ns for p in out.rglob("*.npz")} == before
 
 
-def test_what_cannot_be_compared_is_said_before_anything_is_played(run, refused, tmp_path, policy, tiny):
+def test_what_cannot_be_compared_is_said_before_anything_is_played(refused, tmp_path, policy, tiny, evaluated):
     assert "at least two" in refused("compare", policy)
     assert "there are no results at 'none.json'" in refused("compare", policy, "none.json")
     (tmp_path / "link.gauge.pt").symlink_to(policy)
     same = "are one and the same; a comparison needs different policies or results"
     assert refused("compare", policy, "link.gauge.pt", "--suite", tiny) == f"'{policy}' and 'link.gauge.pt' {same}"
-    first = tmp_path / "first"
-    done = run("evaluate", policy, "--suite", tiny, "--threads", 1, "--out", first)
-    assert done.exit_code == 0, done.output
+    first = shutil.copytree(evaluated, tmp_path / "first")
     shutil.copy(first / "results.json", "card.json")
     for other in ("first", "first/results.json", "card.json"):
         assert refused("compare", "first", policy, other, "--suite", tiny) == f"'first' and '{other}' {same}"
@@ -56,8 +70,8 @@ def test_what_cannot_be_compared_is_said_before_anything_is_played(run, refused,
     assert not (tmp_path / "results").exists()
 
 
-def test_what_was_not_made_alike_is_refused_before_anything_is_played(run, refused, tmp_path, policy, tiny):
-    assert run("evaluate", policy, "--suite", tiny, "--threads", 1, "--out", "first").exit_code == 0
+def test_what_was_not_made_alike_is_refused_before_anything_is_played(refused, tmp_path, policy, tiny, evaluated):
+    shutil.copytree(evaluated, "first")
     alike = ("compare", "first", policy, "--suite", tiny)
     for choices, words in (
         (

@@ -58,7 +58,10 @@ def test_what_is_read_is_not_written_over(refused, backwards, tmp_path, option):
     assert mine.read_text() == "# mine"
 
 
-def test_json_holds_it_all(run):
+def test_json_holds_it_all(run, monkeypatch):
+    fitting = diagnosis.fitting_presets
+    one = lambda robot, width: {k: v for k, v in fitting(robot, width).items() if k == "HIMLoco"}  # noqa: E731
+    monkeypatch.setattr(diagnosis, "fitting_presets", one)
     result = run("doctor", "pretrained", "--seconds", 1, "--threads", 1, "--json")
     assert result.exit_code == 0, result.output
     data = json.loads(result.stdout)

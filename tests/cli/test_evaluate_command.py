@@ -27,9 +27,12 @@ def reproducible(folder: Path) -> tuple[dict, bytes]:
     return results, (folder / "episodes.csv").read_bytes()
 
 
-def test_what_went_wrong_is_said_in_words(run, tmp_path, policy, tiny):
+def test_a_part_is_called_one_and_what_went_wrong_is_said_in_words(run, tmp_path, policy, tiny):
     part = ("--terrain", "flat", "--friction", 0.6, "--seed", 0)
-    assert run("evaluate", policy, "--suite", tiny, *part, "--out", tmp_path / "run", "--threads", 1).exit_code == 0
+    done = run("evaluate", policy, "--suite", tiny, *part, "--out", tmp_path / "run", "--threads", 1)
+    assert done.exit_code == 0, done.output
+    printed = " ".join(done.stdout.split())
+    assert "score of a part (1 of 2 terrains, 1 of 2 frictions" in printed and "(no interval: one seed)" in printed
     result = read_result(tmp_path / "run", StoreError)
     said = []
     console = SimpleNamespace(print=lambda *_: None, say=lambda text: said.append(str(text)))
@@ -40,20 +43,6 @@ def test_what_went_wrong_is_said_in_words(run, tmp_path, policy, tiny):
     said.clear()
     print_results(console, replace(result, health=Health(episodes=3)))
     assert not any("quality episodes" in line for line in said)
-
-
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        (("--terrain", "flat", "--friction", 0.6), "score of a part (1 of 2 terrains, 1 of 2 frictions) 0."),
-        (("--terrain", "flat", "--friction", 9, "--seed", 77), "score of a custom run (friction 9, seed 77"),
-        (("--terrain", "flat", "--friction", 0.6, "--seed", 0), "(no interval: one seed)"),
-    ],
-)
-def test_only_the_whole_suite_gives_its_score(run, tmp_path, policy, tiny, options, words):
-    done = run("evaluate", policy, "--suite", tiny, *options, "--out", tmp_path / "run", "--threads", 1)
-    assert done.exit_code == 0, done.output
-    assert words in " ".join(done.stdout.split())
 
 
 def test_results_and_their_reproducibility(run, refused, tmp_path, policy, tiny):

@@ -58,7 +58,7 @@ def write(path: Path, module: nn.Module) -> Path:
 @pytest.mark.parametrize(
     ("kind", "inside"),
     [
-        (InForward, False),
+        pytest.param(InForward, False, marks=pytest.mark.slow),
         pytest.param(InReset, False, marks=pytest.mark.slow),
         (InSetstate, False),
         (InForward, True),

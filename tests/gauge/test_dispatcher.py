@@ -100,7 +100,7 @@ def outcomes(chance):
 
 def test_neither_workers_nor_their_order_nor_speculation_show_in_what_counts():
     chance, speculative = random.Random(3), 0
-    for _ in range(12):
+    for _ in range(6):
         success, found = outcomes(chance), []
         for count, worlds, speculation in ((1, 24, Speculation()), (3, 24, Speculation(at_work=48)), (1, 500, EAGER)):
             workers = Workers(count, worlds, success, chance)
@@ -119,7 +119,7 @@ def test_neither_workers_nor_their_order_nor_speculation_show_in_what_counts():
 
 def test_a_run_that_is_killed_again_and_again_plays_nothing_twice_and_loses_nothing():
     chance = random.Random(4)
-    for _ in range(8):
+    for _ in range(4):
         success = outcomes(chance)
         whole, *_ = finish(Workers(2, 24, success, chance))
         records, ended = {}, []
@@ -217,7 +217,7 @@ class Mortal(Workers):
 
 def test_lost_workers_lose_nothing_and_do_not_show_in_what_counts():
     chance, deaths = random.Random(6), 0
-    for _ in range(8):
+    for _ in range(4):
         success = outcomes(chance)
         expected, *_ = finish(Workers(1, 24, success, chance))
         workers = Mortal(4, 24, success, chance)
