@@ -13,8 +13,6 @@ def find_device(name: str, backend: str, *, gpu: bool = True) -> torch.device:
 
     Args:
         name: ``cpu``, ``cuda`` or ``cuda:N``.
-        backend: the engine that asks, for the message.
-        gpu: True where the engine runs on GPUs.
 
     Raises:
         BackendError: no device has this name.

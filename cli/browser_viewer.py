@@ -249,9 +249,6 @@ def serve(sessions: Sequence[PlaySession], maker: WorldMaker, chosen: Choice, as
     """Serve the page until Ctrl-C or until ``asked.seconds`` of simulated time are over.
 
     Args:
-        sessions: the first worlds, one for each policy; all worlds are closed at the end.
-        maker: makes the worlds that are chosen on the page.
-        chosen: the choice that made the first worlds.
         asked: gives host, port, time and the robots' first command; without one they walk to the target, or on a tour.
 
     Raises:

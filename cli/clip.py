@@ -24,7 +24,6 @@ def make_clip(folder: Path, result: Result, options: Sequence[str]) -> str | Non
 
     Args:
         result: the robot is shown where it was judged, at the level that it reached.
-        options: of ``gaitgauge play``: the policy and what it is played with.
 
     Returns:
         None, or why there is no film, in one sentence.

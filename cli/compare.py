@@ -31,12 +31,7 @@ def run_comparison(
 def show_comparison(
     work: Callable[..., tuple[dict[str, Any], dict[str, Path]]], name: str, *, out: Path | None, json_output: bool
 ) -> None:
-    """Do the work of a comparison, show progress, print which differences are real and where the files are.
-
-    Args:
-        work: takes the options of ``compare_all`` from ``folder`` on.
-        name: of the folder by default.
-    """
+    """Do the work of a comparison, show progress, print which differences are real and where the files are."""
     console = Terminal(stderr=True)
     with resumable(console, "gauging") as display:
         found, paths = work(

@@ -54,8 +54,6 @@ def draw(
     Args:
         tiles: the robots, from left to right.
         size: width and height of each tile [pixels].
-        shots: taken as they are needed.
-        processes: as ``processes_for`` returns it.
 
     Yields:
         (height, width of all tiles, 3) uint8, and the shot's note.

@@ -42,7 +42,6 @@ def annotate(picture: np.ndarray, readouts: Sequence[Readout]) -> np.ndarray:
 
     Args:
         picture: (height, width, 3) uint8; is not changed.
-        readouts: from left to right.
     """
     image = Image.fromarray(picture)
     width = image.width // len(readouts)

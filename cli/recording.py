@@ -45,10 +45,6 @@ class Recording:
 def record(wanted: Recording, quality: Quality, progress: Callable[[float], None] = lambda share: None) -> None:
     """Play and film.
 
-    Args:
-        quality: as ``choose_renderer`` returns it.
-        progress: gets the share that is done, 0 to 1.
-
     Raises:
         UserError: a file cannot be written.
     """

@@ -28,7 +28,6 @@ def command(app: typer.Typer, name: str | None = None, *, long: bool = False) ->
     them, and the function gets the dataclass. Values that may be repeated arrive as tuples.
 
     Args:
-        name: of the command; None for the function's own.
         long: it shows its progress, and that it starts until then.
     """
 

@@ -59,11 +59,7 @@ def film_failures(
 
 
 def film_scenario(path: Path, prepared: PreparedSearch, scenario: Scenario, place: str, quality: Quality) -> None:
-    """Play a scenario with seed 0 and film it.
-
-    Args:
-        place: words about it for the picture.
-    """
+    """Play a scenario with seed 0 and film it."""
     period = prepared.loaded.policy.contract.control_period
     label, robot = prepared.label, prepared.robot
     poses: list[np.ndarray] = []

@@ -86,8 +86,6 @@ def study_in(
 
     Args:
         name: its page is ``<name>.html``.
-        title: of the progress display.
-        data: name of the file of its results.
         check: called in the locked folder before anything is played.
     """
     # the folder first: an error in it is shown before anything is played
@@ -131,8 +129,6 @@ def make_study(
 
     Args:
         name: of the study: its page is ``<name>.html``, its folder by default ``results/<name>-<policies>``.
-        data: name of the file of its results.
-        title: of the progress display.
     """
     files = found_policies(policy_files(request.policies))
     usual = Path("results") / f"{name}-{joined_names(request.policies)}"

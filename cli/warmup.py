@@ -29,7 +29,6 @@ def run_warmup(
 
     Args:
         robot: name or path; its numbers of joints and feet are part of the kernels.
-        cache: folder of the kernels, None for Warp's own.
 
     Raises:
         UserError: no architecture and no GPU, or an engine without kernels.

@@ -155,7 +155,6 @@ def edited(source: str, error: type[Exception], *others: type[Exception]) -> Ite
 
     Args:
         source: the file, the beginning of the sentence.
-        others: further classes of errors with the same meaning.
     """
     caught: tuple[type[Exception], ...] = (LookupError, TypeError, AttributeError, ValueError, ArithmeticError, *others)
     try:
@@ -279,7 +278,6 @@ def build(
 
     Args:
         kind: the dataclass; its annotations are the rules.
-        data: result of a parser above; lists stand for tuples.
         source: origin of the data, the beginning of every sentence.
         false_is_none: ``false`` stands for None where a field may be None, and sentences say so: TOML has no null.
         extra: refuse or ignore entries that no field names.

@@ -221,11 +221,8 @@ def evaluate(
     """Evaluate a policy; every finished episode is on disk at once, so that nothing is lost when the process is killed.
 
     Args:
-        request: what to do, as it is or prepared already.
         folder: where ``results.json``, ``episodes.csv``, ``report.html`` and ``episodes/`` go.
         resume: go on with what the folder holds.
-        command: the command line, for the provenance.
-        watch: called a few times a second.
 
     Raises:
         SuiteError, RobotError, PolicyError, ContractError, BackendError, WorkerError, ClusterError, StoreError, RecordError: one

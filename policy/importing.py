@@ -26,11 +26,8 @@ def import_policy(
     there only where it is trusted.
 
     Args:
-        source: a file or name as in ``load_policy``.
         destination: the file to write; an existing file is replaced only once the source has been loaded.
-        robot: name or path of the robot, as in ``load_policy``; the file remembers it.
         trust: as in ``load_policy``; the imported file, if it carries a program, needs it in turn.
-        contract_file: as in ``load_policy``.
 
     Returns:
         The policy, with the contract that was stored.

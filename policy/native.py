@@ -103,7 +103,6 @@ def save_policy(path: str | Path, contract: PolicyContract, network: StoredNetwo
 
     Args:
         path: conventionally ``model_<iteration>.pt`` for a checkpoint and ``<name>.gauge.pt`` for an import.
-        contract: what the policy expects of the loop that runs it.
 
     Raises:
         PolicyError: the network does not fit the contract, or the file cannot be written.
@@ -160,9 +159,6 @@ def is_policy(entries: Mapping[str, Any]) -> bool:
 
 def read_policy(entries: Mapping[str, Any], *, source: str) -> tuple[PolicyContract, StoredNetwork | ForeignFile]:
     """Return the contract and network from a loaded file's dictionary.
-
-    Args:
-        entries: the dictionary; its ``format`` has been checked.
 
     Raises:
         PolicyError: the file is of another version, incomplete or malformed.

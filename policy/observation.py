@@ -32,9 +32,6 @@ class ObservationBuilder:
         """Prepare buffers and index maps.
 
         Args:
-            robot: the robot; the physics uses its joint order.
-            num_episodes: number of rows N.
-            device: where the physics' tensors live.
             ground: what a ``height_scan`` reads; None for policies without one.
 
         Raises:

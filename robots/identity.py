@@ -126,7 +126,6 @@ def unpacked(known: RobotIdentity, folder: Path, *, largest: int = _LARGEST_UNPA
     """Write a robot's files into an empty folder, where they must stay while the robot is in use.
 
     Args:
-        known: the robot, perhaps a foreign one.
         largest: most unpacked size [bytes].
 
     Raises:

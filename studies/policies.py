@@ -39,8 +39,6 @@ def load_policies(
     Args:
         names: what ``gaitgauge evaluate`` takes; one that is named twice is loaded once.
         robot: name of the robot that they have to fit, or its ``robot.toml``; None for each one's own.
-        trust: run programs that files of the project's own format carry inside.
-        contract_file: description of those that have no contract inside.
 
     Raises:
         RobotError: the robot that was asked for cannot be had.

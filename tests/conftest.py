@@ -38,6 +38,14 @@ def pytest_collection_finish() -> None:
 
 
 @pytest.fixture(scope="session", autouse=True)
+def no_test_waits_for_the_disk() -> Iterator[None]:
+    """Files are flushed to the disk thousands of times, a hundredth of a second each; ``test_writing.py`` counts the calls."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("os.fsync", lambda descriptor: None)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
 def nothing_is_found_twice() -> Iterator[None]:
     """Typer's runner builds all commands anew for every line, and Python searches all that is installed for every plug-in.
 
@@ -59,11 +67,21 @@ def nothing_is_found_twice() -> Iterator[None]:
 def robots_that_ship_are_read_once() -> Iterator[None]:
     """Nearly every test begins with one of them, and takes longer to read and compile it than for anything else."""
     import mujoco
-    from gaitgauge.robots import loading, registry
+    from gaitgauge.robots import Robot, loading, registry
 
     own, folder = registry._own(), Path(registry.__file__).resolve().parent
     named, files, compiled = registry._named, loading.model_files, mujoco.MjModel.from_xml_path
     known, listed, model = cache(named), cache(files), cache(compiled)
+    plain, digests = loading.robot_digest, {}
+
+    def named_once(text: str) -> Robot:
+        if text not in own:
+            return named(text)
+        digests.setdefault(id(known(text)), plain(known(text)))
+        return known(text)
+
+    def robot_digest(robot: Robot) -> str:
+        return digests.get(id(robot)) or plain(robot)
 
     def ships(path: str | Path, *others: object) -> bool:
         return not any(others) and Path(path).is_relative_to(folder)
@@ -75,7 +93,9 @@ def robots_that_ship_are_read_once() -> Iterator[None]:
         return copy(model(path)) if ships(path, *assets) else compiled(path, *assets)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(registry, "_named", lambda text: known(text) if text in own else named(text))
+        patch.setattr(registry, "_named", named_once)
+        for module in ("robots.checks.checking", "gauge.evaluate", "studies.consistency.prepared"):
+            patch.setattr(f"gaitgauge.{module}.robot_digest", robot_digest)
         patch.setattr(loading, "model_files", model_files)
         patch.setattr(mujoco.MjModel, "from_xml_path", staticmethod(from_xml_path))
         yield

@@ -44,10 +44,6 @@ def start_processes(count: int, arguments: Sequence[str]) -> int:
 
     The first process writes to the terminal. What others printed is shown where they failed first or the first one was killed.
 
-    Args:
-        count: of processes.
-        arguments: of the program.
-
     Returns:
         The exit code of the first process that failed, otherwise 0.
     """

@@ -97,9 +97,7 @@ def run_conformance(
     """Run the conformance checks against an engine and return one result for each.
 
     Args:
-        backend, device, robot: as for ``make_bench``.
         only: beginnings of the names of the checks to run (``motors``, ``contact/rest``); empty for all.
-        report: called with each result at once.
 
     Raises:
         BackendError: no check has such a name, or as ``make_bench``.

@@ -59,11 +59,9 @@ def play(
     """Play until no plan requires anything; returns what was played, and what it took.
 
     Args:
-        planners: one for each environment.
         records: episodes that have ended; those that end are added.
         keep: called with each record once, before anything follows from it.
         workers: the workers that play. They have stopped on return; the caller closes the transport.
-        watch: called whenever a worker reports.
 
     Raises:
         PolicyError, BackendError …: what went wrong in a worker.

@@ -40,7 +40,6 @@ def contract_of(
         data: the table; it is changed.
         robot: the robot, under whatever name it is asked for; None where it is not installed and the table says everything.
         source: origin of the table, the beginning of every sentence.
-        provenance: of the contract.
 
     Raises:
         PolicyError: a field is unknown, missing or malformed.

@@ -26,7 +26,6 @@ class FencedPolicy(FilePolicy):
         """Try the program on zeros and find out how to run it in batches.
 
         Args:
-            program: the process that has loaded it.
             encoder: the same of the network that runs first, where the contract has one.
 
         Raises:

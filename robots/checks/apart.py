@@ -26,7 +26,6 @@ def run_apart(work: Callable[[], str | None], mjcf: Path) -> str:
 
     Args:
         work: raises ``RobotError`` for a fault, or returns a text.
-        mjcf: the model; folders of the files that it names can be read.
 
     Raises:
         RobotError: as ``work``; or the work takes too much time or memory, or MuJoCo crashes.

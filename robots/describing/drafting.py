@@ -129,10 +129,7 @@ def draft_robot(
     """Read a model in a process of its own, mend a copy, and guess the values that it lacks.
 
     Args:
-        model: MJCF of the robot alone.
-        name: of the robot; None for the model's.
         folder: for the description and a model with names; None for the model's folder.
-        answers: what the robot's owner says of it.
 
     Raises:
         RobotError: MuJoCo cannot compile the model, it is no legged robot on a free base, or it cannot be told which limbs are legs.

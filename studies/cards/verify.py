@@ -72,9 +72,6 @@ def prepare_replay(
 
     Args:
         policy: the policy's file, where it is not at the card's path and none that ships.
-        beside: the card's folder, where its policy is looked for as well.
-        suite: name or ``.toml`` file, where the suite is one of the user's own.
-        contract: description of the policy, where the card was made with one.
         quick: one environment of each terrain, at nominal friction and payload where the card has it, else the card's first.
         fresh: number from which other seeds than the card's are made; None for the card's.
 

@@ -147,7 +147,6 @@ def compare(results: Sequence[Result], labels: Sequence[str] | None = None) -> C
     """Compare all pairs of some results.
 
     Args:
-        results: two or more.
         labels: names of the policies; None for those of their files, see ``distinct_names``.
 
     Raises:

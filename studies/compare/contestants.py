@@ -48,11 +48,8 @@ def compare_all(
 
     Args:
         request: how policies are evaluated; its policy is replaced by each.
-        folder: where the comparison goes.
         overwrite: write over a comparison of other results there; False for ``<folder>-2`` … in its place.
         runs: folder of the evaluations; what it holds is gone on with.
-        watch: called a few times a second during an evaluation.
-        say: called with a sentence where seeds are added.
 
     Raises:
         ComparisonError and those of ``evaluate``: one sentence. What can be known to be wrong is said before anything is played.

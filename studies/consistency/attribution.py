@@ -92,8 +92,6 @@ def effect_of_switch(
     """What switching a factor does to an engine's score and metrics, and to its gap to other engines.
 
     Args:
-        base: the engine as the suite has it.
-        switched: the same engine with the factor switched.
         others: records by label of the engines that differ from ``base``.
         name: seeds the intervals' generators.
 

@@ -107,9 +107,7 @@ def play_variant(
 
     Args:
         records: episodes that have ended; those that end are added.
-        keep: called with each record.
         threads: CPU threads; results do not depend on them.
-        watch: called now and then with how far playing is.
         meter: estimates it; None for one that knows nothing yet.
 
     Raises:

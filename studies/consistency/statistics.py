@@ -104,7 +104,6 @@ def replicates(values: Array, weights: Array, *, shared: bool, resamples: int, n
         values: one number for each environment and seed, (E, S).
         weights: of the environments, adding up to one, (E,).
         shared: draw the same seeds for all environments (their episodes share random numbers), or anew for each.
-        resamples: number of replicates B.
         name: seeds the generator, so that the same question has the same answer.
     """
     environments, seeds = values.shape
@@ -201,7 +200,6 @@ def outcome_agreement(
 
     Args:
         reference, compared: outcomes in both engines, (N,).
-        seeds: of the episodes, (N,).
         shared: whether episodes of one seed share its random numbers.
 
     Returns:

@@ -51,9 +51,7 @@ def study(
     Returns the content of ``consistency.json`` (docs/guides/consistency.md).
 
     Args:
-        request: what to compare, as it is or prepared already.
         folder: where ``consistency.json`` and a folder for each engine go (with several policies, one for each of them above).
-        watch: called a few times a second.
         told: called before anything is played with what the study takes, and what more of it would.
 
     Raises:

@@ -118,8 +118,6 @@ def diagnose(
     """Play a policy as described, as presets say, and, where it does not walk yet, with likely changes one after the other.
 
     Args:
-        seconds: how long each is played.
-        threads: CPU threads of the physics; results do not depend on them.
         report: called with the number of changes that the contracts being played differ in, how many there are, and how many
             of them have been played.
 

@@ -95,7 +95,6 @@ def verdict(
     """Return what the engines say of one policy, as plain data.
 
     Args:
-        found: records by engine, of those that played.
         families: family of each engine.
         home: families in which the policy was trained or tuned; empty where its file does not say.
         name: of the policy; seeds the intervals' generators.

@@ -34,11 +34,6 @@ def score_sets(
     Args:
         request: how it is evaluated; its ``parameters`` are replaced by each set.
         sets: names or files, as for ``find_set``; the first is the one that the others are compared with.
-        folder: of the comparison.
-        overwrite: as of ``compare_all``.
-        runs: folder of the evaluations; what it holds is gone on with.
-        watch: called a few times a second during an evaluation.
-        say: called with a sentence where seeds are added.
 
     Raises:
         LogError: fewer than two sets, or two of one name.

@@ -124,10 +124,6 @@ def run_scenario(
 ) -> list[Trial]:
     """Send a robot through a scenario for each seed.
 
-    Args:
-        seeds: one for each trial.
-        threads: CPU threads; results do not depend on them.
-
     Raises:
         BackendError: the engine cannot do what the scenario asks for.
         ContractError, PolicyError: the policy is not for this robot, or its output is not finite.

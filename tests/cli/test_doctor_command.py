@@ -7,6 +7,7 @@ from dataclasses import replace
 import pytest
 from gaitgauge.cli import doctor
 from gaitgauge.policy.contract import PolicyContract
+from gaitgauge.policy.foreign.presets import find_preset
 from gaitgauge.policy.loading import load_policy
 from gaitgauge.policy.native import save_policy
 from gaitgauge.studies.doctor import diagnosis
@@ -60,7 +61,10 @@ def test_what_is_read_is_not_written_over(refused, backwards, tmp_path, option):
 
 def test_json_holds_it_all(run, monkeypatch):
     fitting = diagnosis.fitting_presets
-    one = lambda robot, width: {k: v for k, v in fitting(robot, width).items() if k == "HIMLoco"}  # noqa: E731
+
+    def one(robot, width):
+        return {k: v for k, v in fitting(robot, width).items() if find_preset(k).title == "HIMLoco"}
+
     monkeypatch.setattr(diagnosis, "fitting_presets", one)
     result = run("doctor", "pretrained", "--seconds", 1, "--threads", 1, "--json")
     assert result.exit_code == 0, result.output

@@ -217,7 +217,7 @@ class Mortal(Workers):
 
 def test_lost_workers_lose_nothing_and_do_not_show_in_what_counts():
     chance, deaths = random.Random(6), 0
-    for _ in range(4):
+    for _ in range(8):
         success = outcomes(chance)
         expected, *_ = finish(Workers(1, 24, success, chance))
         workers = Mortal(4, 24, success, chance)

@@ -3,14 +3,11 @@
 import ast
 from functools import cache
 from graphlib import TopologicalSorter
-from pathlib import Path
 
-import gaitgauge
+from product_sources import PACKAGES, ROOT, import_statements
 
-ROOT = Path(gaitgauge.__path__[0])
-ORDER = ("files", "robots", "terrains", "backends", "policy", "gauge", "studies", "training", "cli")
 ROOMS = ("training", "training.environment", "training.algorithms", "training.tasks", "training.run", "training.sweep")
-FILES = {f.relative_to(ROOT).with_suffix("").parts: f for package in ORDER for f in (ROOT / package).rglob("*.py")}
+FILES = {file.relative_to(ROOT).with_suffix("").parts: file for file in import_statements()}
 MODULES = {".".join(parts[:-1] if parts[-1] == "__init__" else parts): file for parts, file in FILES.items()}
 
 
@@ -18,7 +15,7 @@ MODULES = {".".join(parts[:-1] if parts[-1] == "__init__" else parts): file for 
 def imports(module: str) -> set[str]:
     """Modules of the package that a module imports."""
     found, here = set(), (*module.split("."), "")[: None if MODULES[module].name == "__init__.py" else -1]
-    for node in ast.walk(ast.parse(MODULES[module].read_text(encoding="utf-8"))):
+    for node in import_statements()[MODULES[module]]:
         if isinstance(node, ast.ImportFrom) and node.level:
             base = ".".join(filter(None, (*here[: len(here) - node.level], node.module)))
             found |= {f"{base}.{a.name}" if f"{base}.{a.name}" in MODULES else base for a in node.names}
@@ -32,7 +29,7 @@ def room(module: str) -> str:
 def test_packages_and_the_rooms_of_training_import_downwards():
     pairs = [(module, used) for module in MODULES for used in imports(module)]
     assert len(pairs) > 1000
-    assert [p for p in pairs if ORDER.index(p[0].split(".")[0]) < ORDER.index(p[1].split(".")[0])] == []
+    assert [p for p in pairs if PACKAGES.index(p[0].split(".")[0]) < PACKAGES.index(p[1].split(".")[0])] == []
     inside = [pair for pair in pairs if all(module.startswith("training") for module in pair)]
     assert [p for p in inside if ROOMS.index(room(p[0])) < ROOMS.index(room(p[1]))] == []
 

@@ -10,14 +10,9 @@ import sys
 import tomllib
 import zipfile
 from importlib.metadata import packages_distributions
-from pathlib import Path
 
-import gaitgauge
 import pytest
-
-ROOT = Path(gaitgauge.__path__[0])
-TOP = ("backends", "cli", "files", "gauge", "policy", "robots", "studies", "terrains", "training")
-
+from product_sources import PACKAGES, ROOT, import_statements
 
 PARTS = {
     "google": "protobuf",
@@ -41,14 +36,13 @@ def distribution(requirement: str) -> str:
 def imported() -> dict[str, str]:
     """What the package imports of others, and where: distributions."""
     known, found = packages_distributions(), {}
-    for top in TOP:
-        for file in (ROOT / top).rglob("*.py"):
-            for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
-                names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
-                if isinstance(node, ast.ImportFrom) and not node.level and node.module:
-                    names = [node.module]
-                for module in {name.partition(".")[0] for name in names} - sys.stdlib_module_names - {"gaitgauge"}:
-                    found[distribution(PARTS.get(module) or known.get(module, [module])[0])] = str(file)
+    for file, statements in import_statements().items():
+        for node in statements:
+            names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
+            if isinstance(node, ast.ImportFrom) and not node.level and node.module:
+                names = [node.module]
+            for module in {name.partition(".")[0] for name in names} - sys.stdlib_module_names - {"gaitgauge"}:
+                found[distribution(PARTS.get(module) or known.get(module, [module])[0])] = str(file)
     return found
 
 
@@ -77,7 +71,7 @@ def test_every_folder_with_code_is_an_installed_package(monkeypatch):
     monkeypatch.chdir(ROOT)
     runpy.run_path("setup.py")
     found = {"gaitgauge"}
-    for top in TOP:
+    for top in PACKAGES:
         for file in (ROOT / top).rglob("*.py"):
             found.add(".".join(("gaitgauge", *file.parent.relative_to(ROOT).parts)))
     assert set(named["packages"]) == found
@@ -95,7 +89,7 @@ def test_a_wheel_runs_from_any_folder(tmp_path):
     with zipfile.ZipFile(wheel) as archive:
         archive.extractall(site)
     tracked = subprocess.run(
-        ["git", "ls-files", *TOP], cwd=ROOT, check=True, capture_output=True, text=True
+        ["git", "ls-files", *PACKAGES], cwd=ROOT, check=True, capture_output=True, text=True
     ).stdout.split()
     missing = [name for name in tracked if not (site / "gaitgauge" / name).is_file()]
     assert not missing

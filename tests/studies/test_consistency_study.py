@@ -5,6 +5,7 @@ import hashlib
 import json
 import os
 import re
+import shutil
 import signal
 import zlib
 from dataclasses import replace
@@ -68,16 +69,15 @@ def short_open_loop(monkeypatch):
     monkeypatch.setattr(open_loop, "DURATION", DURATION)
 
 
-@pytest.fixture
-def request_of(tmp_path):
-    """A small request of two engines; its parts can be replaced."""
+def requests_in(folder):
+    """Return a maker of small requests of two engines; their parts can be replaced."""
     arguments = {"frame_width": 45, "num_actions": 12, "hidden": [8]}
     zeros = {name: torch.zeros_like(value) for name, value in MlpNetwork(**arguments).state_dict().items()}
-    policy = tmp_path / "standing <b>.gauge.pt"
+    policy = folder / "standing <b>.gauge.pt"
     save_policy(
         policy, standard_contract(GO2), StoredNetwork(architecture="mlp", arguments=arguments, state_dict=zeros)
     )
-    suite = tmp_path / "tiny.toml"
+    suite = folder / "tiny.toml"
     suite.write_text(SUITE)
     whole = StudyRequest(
         policies=(str(policy),),
@@ -92,6 +92,11 @@ def request_of(tmp_path):
         return dataclasses.replace(whole, **changes)
 
     return make_request
+
+
+@pytest.fixture
+def request_of(tmp_path):
+    return requests_in(tmp_path)
 
 
 def drifting(backend):
@@ -126,6 +131,15 @@ def zero(estimate):
     return estimate["value"] == 0.0 and estimate["interval"] == [0.0, 0.0]
 
 
+@pytest.fixture(scope="module")
+def drifted(tmp_path_factory):
+    """A study with attribution in which the compared engine drifts: its request, folder and results."""
+    folder = tmp_path_factory.mktemp("drifted")
+    request = requests_in(folder)(terrains=BOTH, attribution=True, factors=("tolerance", "contacts"))
+    with patch.object(open_loop, "DURATION", DURATION):
+        return request, folder / "out", study(request, folder / "out", make=engine(motion=drifting))
+
+
 def test_identical_engines_have_no_gap(request_of, tmp_path):
     request = request_of(terrains=BOTH)
     results = study(request, tmp_path / "out", make=engine())
@@ -146,10 +160,9 @@ def test_identical_engines_have_no_gap(request_of, tmp_path):
     assert results == json.loads((tmp_path / "out" / "consistency.json").read_text())
 
 
-def test_shifted_engine_is_found_out(request_of, tmp_path):
-    results = study(request_of(), tmp_path / "out", make=engine(motion=drifting))
-    pair = only_pair(results)
-    overall = pair["overall"]
+def test_shifted_engine_is_found_out(drifted):
+    results = drifted[2]
+    overall = only_pair(results)["terrains"]["flat"]
     assert overall["gap"]["value"] > 0.01
     assert overall["gap"]["interval"][0] > 0.0
     assert overall["excess"]["interval"][0] > 0.0
@@ -170,8 +183,8 @@ def test_falls_in_one_engine_are_counted(request_of, tmp_path):
     assert (fell["only_reference"], fell["only_compared"], fell["same"]) == (0, 3, 0.0)
 
 
-def test_gap_is_the_mean_magnitude_of_the_rows(request_of, tmp_path):
-    pair = only_pair(study(request_of(terrains=BOTH), tmp_path / "out", make=engine(motion=drifting)))
+def test_gap_is_the_mean_magnitude_of_the_rows(drifted):
+    pair = only_pair(drifted[2])
     by_terrain = {}
     for row in pair["episodes"]:
         if row["stage"] == "eval":
@@ -214,9 +227,9 @@ def test_attribution_switches_one_factor_and_finds_the_one_that_matters(request_
     ]
 
 
-def test_a_study_goes_on_where_it_stopped(request_of, tmp_path):
-    request, folder = request_of(terrains=BOTH), tmp_path / "out"
-    first = study(request, folder, make=engine(motion=drifting))
+def test_a_study_goes_on_where_it_stopped(drifted, tmp_path):
+    request, _, first = drifted
+    folder = shutil.copytree(drifted[1], tmp_path / "out")
     with pytest.raises(StoreError, match="--resume"):
         study(request, folder, make=engine())
     files = sorted((folder / "fake" / "episodes").glob("*.npz"))
@@ -227,7 +240,7 @@ def test_a_study_goes_on_where_it_stopped(request_of, tmp_path):
     assert {p: p.stat().st_mtime_ns for p in files[1:]} == before
     assert again["policies"] == first["policies"]
     with pytest.raises(StoreError, match="another run"):
-        study(request_of(terrains=BOTH, seeds=4), folder, resume=True, make=engine())
+        study(dataclasses.replace(request, seeds=4), folder, resume=True, make=engine())
 
 
 def test_engines_that_cannot_run_are_left_out_until_one_is_left(request_of, tmp_path, monkeypatch):
@@ -242,7 +255,7 @@ def test_engines_that_cannot_run_are_left_out_until_one_is_left(request_of, tmp_
     assert not (tmp_path / "two").exists()
 
 
-def test_engine_that_fails_while_playing_is_left_out(request_of, tmp_path):
+def test_engine_that_fails_while_playing_is_left_out(request_of, tmp_path, monkeypatch):
     def make(name, scene, *, device, threads):
         if scene.physics.impratio == 1.0:
             raise BackendError("it has no impratio")
@@ -251,7 +264,11 @@ def test_engine_that_fails_while_playing_is_left_out(request_of, tmp_path):
     request = request_of(
         backends=("fake", "fake@cone=pyramidal", "fake@impratio=1"), attribution=True, factors=("impratio",)
     )
-    results = study(request, tmp_path / "out", make=make)
+    prepared = studying.prepare_study(request)
+    with monkeypatch.context() as patched:
+        patched.setattr(studying, "prepare_study", None)  # what was prepared is not prepared again, nor changed
+        results = study(prepared, tmp_path / "out", make=make)
+    assert prepared.skipped == [] and len(prepared.others) == 2
     assert results["skipped"] == [{"backend": "fake@impratio=1", "reason": "it has no impratio"}]
     assert results["policies"][0]["attribution"][0]["not_run"] == "it has no impratio"
     with pytest.raises(ConsistencyError, match="it has no impratio"):
@@ -291,19 +308,6 @@ def test_every_layer_plays_with_the_gains_of_the_suite_s_rule(request_of, tmp_pa
         assert seen == {(wanted,) * 12}
 
 
-def test_what_was_prepared_is_not_prepared_again_nor_changed(request_of, tmp_path, monkeypatch):
-    def make(name, scene, *, device, threads):
-        if scene.physics.impratio == 1.0:
-            raise BackendError("it has no impratio")
-        return FakeBackend(scene)
-
-    prepared = studying.prepare_study(request_of(backends=("fake", "fake@cone=pyramidal", "fake@impratio=1")))
-    monkeypatch.setattr(studying, "prepare_study", None)
-    results = study(prepared, tmp_path / "out", make=make)
-    assert [s["backend"] for s in results["skipped"]] == ["fake@impratio=1"]
-    assert prepared.skipped == [] and len(prepared.others) == 2
-
-
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
@@ -324,26 +328,23 @@ def test_impossible_requests_are_refused_before_anything_is_written(request_of, 
     assert not (tmp_path / "out").exists()
 
 
-def test_the_reference_can_be_any_engine(request_of, tmp_path):
-    request = request_of(reference="fake@ls_iterations=7")
-    results = study(request, tmp_path / "out", make=engine(motion=drifting))
-    assert results["reference"] == "fake@ls_iterations=7"
-    assert results["compared"] == ["fake"]
-    assert results["policies"][0]["pairs"]["fake"]["overall"]["difference"]["value"] > 0.0
-
-
 @pytest.mark.parametrize("reference", [pytest.param("fake", marks=pytest.mark.slow), "fake@ls_iterations=7"])
-def test_a_difference_has_one_interval_wherever_it_stands(request_of, tmp_path, monkeypatch, reference):
+def test_any_engine_is_the_reference_and_a_difference_has_one_interval(request_of, tmp_path, monkeypatch, reference):
     """Resamples are drawn by name: with another name in another table, one difference would have two intervals."""
+
+    plain = Design.estimate
 
     def estimate(design, values, name, rows=None, *, magnitude=False):
         number = float(zlib.crc32(name.encode()))
-        return Estimate(value=0.0, low=-number, high=number)
+        value = plain(design, values, name, rows, magnitude=magnitude).value
+        return Estimate(value=value, low=-number, high=number)
 
     monkeypatch.setattr(Design, "estimate", estimate)
-    results = study(request_of(reference=reference), tmp_path / "out", make=engine(motion=drifting))["policies"][0]
+    found = study(request_of(reference=reference), tmp_path / "out", make=engine(motion=drifting))
+    results = found["policies"][0]
     (gap,), (pair,) = results["gaps"], results["pairs"].values()
-    assert gap["pair"][0] == reference
+    assert found["reference"] == gap["pair"][0] == reference
+    assert (pair["overall"]["difference"]["value"] > 0.0) is (reference != "fake")
     for name in ("gap", "difference"):
         assert gap["overall"][name] == pair["overall"][name]
 
@@ -365,10 +366,9 @@ def test_factors_by_name():
     assert len(choose_factors([])) > 5
 
 
-def test_page_is_self_contained_and_escapes_names(request_of, tmp_path):
-    request = request_of(attribution=True, factors=("tolerance", "contacts"))
-    results = study(request, tmp_path / "out", make=engine(motion=drifting))
-    html = write_page(tmp_path / "out").read_text()
+def test_page_is_self_contained_and_escapes_names(drifted, tmp_path):
+    _, folder, results = drifted
+    html = write_page(folder).read_text()
     assert html == render(json.loads(json.dumps(results)))
     assert "standing &lt;b&gt;.gauge.pt" in html and "standing <b>" not in html
     assert not re.search(r"(?:src|href)\s*=|url\(|@import", html)

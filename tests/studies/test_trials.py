@@ -181,7 +181,7 @@ def test_what_happens_to_a_robot_depends_on_neither_the_others_nor_threads():
     ground = Ground(begin=0.3, stretches=(Stretch(length=3.0, rise=0.5, steps=5),))
     trial = scenario(
         replace(STAND, seconds=0.1),
-        replace(AHEAD, seconds=0.6),
+        replace(AHEAD, seconds=0.4),
         forces=(pull,),
         ground=ground,
         start=Start(),

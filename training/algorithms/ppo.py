@@ -115,8 +115,6 @@ class PPO:
             observations: the groups ``policy`` (N, F), ``history`` (N, H·F) frame by frame, oldest first, and ``privileged`` (N, P).
             num_actions: width J of an action.
             command_entries: entries of a frame that hold the command.
-            mirror: mirror maps, needed for symmetry.
-            processes: of the run, None for this one alone.
 
         Raises:
             ConfigurationError: an observation group is missing or has an impossible width, or the networks' settings do not fit.

@@ -73,9 +73,6 @@ class TrainingEnvironment(VecEnv):
         """Build the worlds and begin their first episodes.
 
         Args:
-            backend: an engine's registry name.
-            device: torch device of the physics and of everything else.
-            threads: CPU threads for engines that use them.
             capture: replay the torch parts of a step as CUDA graphs; needs a CUDA device.
             fuse: compile the torch parts with ``torch.compile``, which merges their several hundred small kernels into a few; numbers
                 differ in the last digits. None: on a GPU, unless a function of one's own cannot be compiled, which ``unfused`` then says.

@@ -72,10 +72,8 @@ class EnvironmentStep:
         """Allocate everything.
 
         Args:
-            contract: the policy's interface, one frame of observation.
             kind: kind of tile of every world, (N,) int64.
             inputs: tensors that the physics state is copied into before each part.
-            generator: where uniform numbers come from.
             scenarios: those that the worlds of the palette's last kind play.
 
         Raises:

@@ -31,7 +31,6 @@ class Filmer:
             terrains: terrains of the gauge; one film for each.
             command: forward, lateral [m/s] and yaw [rad/s] speed; None for a tour that shows every direction.
             every: film when the run's interval says so.
-            last: film at the end of the run.
         """
         self.every, self.last = every, last
         self._folder = run / VIDEO_FOLDER

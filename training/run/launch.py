@@ -48,11 +48,8 @@ def train(
     """Build environment, networks and run directory, and train.
 
     Args:
-        plan: made by ``prepare``.
         began: value of ``time.monotonic()`` from which the wall-clock limit counts.
         started: called with the run directory before anything slow.
-        progress: called after every iteration.
-        message: called with a sentence now and then.
 
     Returns:
         How it ended, and the run directory.

@@ -52,9 +52,7 @@ class TrainingRunner(RunState):
         Args:
             scorer: gauges the student every ``run.gauge_interval`` iterations.
             filmer: makes videos every ``run.video_interval`` iterations, and at the end.
-            progress: called after every iteration.
             physics: describes an environment's settings for the provenance of the policies, where a stretch changes them.
-            parts: arguments of ``RunState``.
 
         Raises:
             ConfigurationError: environment and settings do not fit together.
@@ -69,7 +67,6 @@ class TrainingRunner(RunState):
         """Train.
 
         Args:
-            iterations: number of iterations to add to those done.
             max_seconds: stop in an orderly way after this wall-clock time [s], None for no limit.
 
         Returns:

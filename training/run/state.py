@@ -49,12 +49,9 @@ class RunState:
         Args:
             env: gives the groups ``policy``, ``history`` and ``privileged``.
             contract: of the policy that is trained, one observation frame wide.
-            task: name of the task, kept in checkpoints.
             log_dir: run directory, None to leave nothing behind.
-            processes: of the run, None for this one alone.
             mirror: left-right mirror maps, needed if the algorithm uses symmetry.
             settings: plain data kept in every checkpoint, so that a resumed run can be built like this one.
-            message: called with a sentence now and then.
 
         Raises:
             ConfigurationError: environment and settings do not fit together.

@@ -66,12 +66,8 @@ def work_through(
     """Do the rest of a sweep, write its tables, and keep trained runs.
 
     Args:
-        folder: its own, absolute.
-        threads, per_gpu, gauging, deadline: as of ``Jobs``.
         report: write the tables of present results, and start nothing.
         keep: folder of kept runs; None for none.
-        say: called with a sentence now and then.
-        watch: called every few seconds with how far all is.
 
     Returns:
         None where no entry can start: then tables of an earlier call, perhaps of another file, are not written over.

@@ -103,15 +103,11 @@ class Jobs:
         """Prepare.
 
         Args:
-            sweep: how the runs are judged.
-            threads: CPU threads of a gauging.
             deadline: value of ``time.monotonic()`` at which to stop, None for no limit.
-            say: called with a sentence now and then.
             gpus: as ``visible_gpus``, which is the default.
             per_gpu: trainings side by side on each GPU.
             sharing: variables in the environment of trainings on GPUs (``sharing.shared_gpus``).
             gauging: options of ``evaluate`` on the workers of a gauging; None for the threads.
-            watch: called every few seconds.
         """
         self._watch, self._told = watch, float("-inf")
         self._taken: dict[bool, list[float]] = {True: [], False: []}  # times of gaugings, and of trainings
