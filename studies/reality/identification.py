@@ -331,6 +331,7 @@ def _identify(problem: _Problem, draws: int, seed: int, say: Say) -> Fit:
     reach = float(student.ppf(0.975, max(blocks - 1, 1)))
     intervals = np.stack([priors - 1.96 * spreads, priors + 1.96 * spreads], axis=1)
     intervals[free] = np.stack([x[free] - reach * spread, x[free] + reach * spread], axis=1)
+    intervals = intervals.clip(*(bound[:, None] for bound in problem.bounds()))
     delays = tuple(float(v) for u, v in zip(problem.unknowns, x, strict=True) if u.key == "delay")
     return Fit(
         parameters=problem.parameters(x),

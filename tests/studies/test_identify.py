@@ -58,6 +58,9 @@ def test_what_a_log_does_not_tell_stays_at_its_prior(log):
     told = {u.label: bool(known) for u, known in zip(found.unknowns, found.known, strict=True)}
     assert not told["armature calf"] and not told["stiffness_factor hip"]
     assert found.parameters.armature == NOMINAL.armature
+    assert all(
+        u.kind.low <= low < high <= u.kind.high for u, (low, high) in zip(found.unknowns, found.intervals, strict=True)
+    )
 
 
 def test_standing_robots_and_odd_names_are_refused(log, tmp_path):
