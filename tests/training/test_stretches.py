@@ -11,7 +11,11 @@ from gaitgauge.training.environment import environment as environment_module
 from gaitgauge.training.environment.configuration import EnvironmentConfiguration, ScheduleConfiguration, Stretch
 from gaitgauge.training.environment.policy_interface import joint_parameters, training_contract
 from gaitgauge.training.environment.stretches import check_stretches, settings_in
+from gaitgauge.training.run import fitting
 from gaitgauge.training.run.checkpoint import read_checkpoint
+from gaitgauge.training.run.fitting import iterations_that_fit
+from gaitgauge.training.run.plan import prepare
+from gaitgauge.training.run.request import TrainRequest
 from gaitgauge.training.run.resuming import resume_run
 from gaitgauge.training.run.runner import TrainingRunner
 from gaitgauge.training.run.seeding import seed_everything
@@ -148,3 +152,37 @@ def test_a_setting_of_the_command_line_holds_in_every_stretch():
     given = find_task("go2-moe-cts", ["environment.physics.cone=pyramidal"]).environment
     assert settings_in(own, 1).physics.cone == "elliptic" and settings_in(own, 0).physics.cone == "pyramidal"
     assert settings_in(given, 1).physics == replace(settings_in(own, 1).physics, cone="pyramidal")
+
+
+def test_the_iterations_that_fit_are_those_of_both_stretches():
+    """By hand: 0.97 · 1000 - 60 = 910 s and 10 iterations done; 90 of 100 iterations at 1 s and 10 at 1.4 s, so 920 / 1.04."""
+    assert iterations_that_fit(done=10, each=1.0, left=1000.0, begins=[0.9]) == int(920 / 1.04)
+    assert iterations_that_fit(done=10, each=2.0, left=1000.0, begins=[]) == 10 + 485
+    assert iterations_that_fit(done=10, each=2.0, left=1.0, begins=[]) == 11
+
+
+def test_a_run_fits_its_schedules_into_the_time(tmp_path, monkeypatch):
+    monkeypatch.setattr(fitting, "SKIPPED", 1)
+    monkeypatch.setattr(fitting, "MEASURED", 2)
+    monkeypatch.setattr(fitting, "iterations_that_fit", lambda **given: 3 if given["begins"] == [0.5] else 0)
+    messages: list[str] = []
+    run = build(tmp_path / "run", messages=messages)
+    run.settings = {"training": {"run": {"iterations": 4}}, "environment": {"schedule": {"horizon_steps": 24}}}
+    outcome = run.learn(TOTAL, max_seconds=600.0, fit=True)
+    assert outcome.iteration == 3 and outcome.reason == "finished"
+    assert float(run.env.progress) == pytest.approx(1.0) and run.env.stretch == 1
+    assert any(text.startswith("3 iterations of 4 fit into the time, ") for text in messages)
+    stored = read_checkpoint(tmp_path / "run" / "model_3.pt")["training"]["settings"]
+    assert stored == {"training": {"run": {"iterations": 3}}, "environment": {"schedule": {"horizon_steps": 18}}}
+
+
+@pytest.mark.parametrize(
+    ("request_", "words"),
+    [
+        ({"fit": True}, "no limit to fit into; add --time"),
+        ({"fit": True, "seconds": 9.0, "resume": "x"}, "keeps its length"),
+    ],
+)
+def test_fitting_needs_a_limit_and_a_new_run(request_, words):
+    with pytest.raises(ConfigurationError, match=words):
+        prepare(TrainRequest(task="toy", **request_))

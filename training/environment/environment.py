@@ -326,6 +326,15 @@ class TrainingEnvironment(VecEnv):
 
     # --- stretches --------------------------------------------------------------------------------------------------
 
+    def set_horizon(self, steps: int) -> None:
+        """Spread the schedules over another number of environment steps of the whole run."""
+        self._given, self.configuration = (
+            replace(each, schedule=replace(each.schedule, horizon_steps=steps))
+            for each in (self._given, self.configuration)
+        )
+        self.cfg = self.configuration
+        self.parts.rate.fill_(1.0 / steps)
+
     @property
     def stretch_ends(self) -> bool:
         """Return True where the next stretch of the schedule is due: ``next_stretch`` begins it."""

@@ -83,6 +83,8 @@ class EnvironmentStep:
         device, num_envs, joints = kind.device, len(kind), robot.num_joints
         seen, terrain, period = configuration.observations, configuration.terrain, configuration.physics.control_period
         self.max_episode_length = round(configuration.episode_length / period)
+        self.rate = torch.tensor(1.0 / configuration.schedule.horizon_steps, device=device)
+        """Fraction of the run that a step is; on the device, since compiled and recorded functions read it."""
         self.default_pose = torch.tensor(robot.default_joint_position, device=device)
         self.action = torch.zeros(num_envs, contract.num_joints, device=device)
         self.scan = scan_pattern(seen.scan_length, seen.scan_width, seen.scan_spacing, device)
@@ -185,7 +187,7 @@ class EnvironmentStep:
 
     def progress(self) -> torch.Tensor:
         """Return the fraction of the run, scalar."""
-        return self.memory.step.float() * (1.0 / self.configuration.schedule.horizon_steps)
+        return self.memory.step.float() * self.rate
 
     def after_physics(self) -> StepResult:
         """Judge the step, update the memory, and prepare the next episode of worlds at the end of one."""

@@ -86,7 +86,9 @@ def train(
                     _describe(plan, run, env, began)
                 limit = plan.request.seconds
                 seconds = None if limit is None else max(limit - (time.monotonic() - began), 0.0)
-                outcome = runner.learn(run_settings.iterations - runner.iteration, max_seconds=seconds)
+                outcome = runner.learn(
+                    run_settings.iterations - runner.iteration, max_seconds=seconds, fit=plan.request.fit
+                )
             if run is not None and plan.request.film and outcome.reason != "signal":
                 page = write_page(run, scores=plan.suite, scalars=runner.logger.scalars)
                 message(f"Page: {page}")

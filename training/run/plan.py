@@ -80,6 +80,11 @@ def prepare(request: TrainRequest) -> TrainPlan:
         raise ConfigurationError(
             "--resume continues a run and --init-from begins a new one with its networks; give one of them"
         )
+    if request.fit and (request.seconds is None or request.resume is not None):
+        lacks = "a resumed run keeps its length" if request.resume else "there is no limit to fit into"
+        raise ConfigurationError(
+            f"--fit fits a new run into --time, and {lacks}; {'leave --fit out' if request.resume else 'add --time'}"
+        )
     request = replace(request, task=settled_name(request.task, request.robot))
     if request.resume is not None:
         return resumed_run(request, request.resume)

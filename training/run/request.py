@@ -51,6 +51,13 @@ class TrainRequest:
     ] = None
     seconds: Annotated[float, Ge(0.0)] | None = None
     """Wall-clock limit [s], building included."""
+    fit: Annotated[
+        bool,
+        Choice(
+            "With --time: shorten the run, schedules included, to the iterations that fit, once its speed is known.",
+            SPAN,
+        ),
+    ] = False
     resume: Annotated[
         str | None,
         Choice(

@@ -23,6 +23,7 @@ from ..configuration import TrainingConfiguration
 from ..processes import ProcessLostError
 from .beside import Scores, Videos
 from .filming import Filmer
+from .fitting import Fit
 from .logger import make_writer
 from .rescue import Rescue
 from .resuming import TrainingDivergedError, intact_checkpoint, remember_physics, save_run
@@ -63,11 +64,12 @@ class TrainingRunner(RunState):
         self._physics = physics
         self._nonfinite = torch.zeros((), dtype=torch.int64, device=self.device)
 
-    def learn(self, iterations: int, *, max_seconds: float | None = None) -> TrainingOutcome:
+    def learn(self, iterations: int, *, max_seconds: float | None = None, fit: bool = False) -> TrainingOutcome:
         """Train.
 
         Args:
             max_seconds: stop in an orderly way after this wall-clock time [s], None for no limit.
+            fit: shorten a new run to the iterations that fit into ``max_seconds``, with all of its schedules.
 
         Returns:
             How it ended. A checkpoint has been written.
@@ -81,10 +83,13 @@ class TrainingRunner(RunState):
         begin = time.monotonic()
         obs = self._begin()
         total, reason, written = self.iteration + iterations, "finished", None
+        fitted = Fit(self) if fit and max_seconds is not None else None
         with StopSignals(self.message) as signals:
             try:
                 while self.iteration < total:
                     obs = self._iterate(obs, lambda: signals.received is not None)
+                    if fitted is not None and max_seconds is not None:
+                        total = fitted.total(total, begin + max_seconds - time.monotonic())
                     stop = self._agreed_stop(signals, begin, max_seconds)
                     ends = bool(getattr(self.env, "stretch_ends", False))
                     written = self._save_and_show(written, last=bool(stop) or ends or self.iteration == total)
