@@ -16,7 +16,7 @@ SLOWER = 1.4
 """Time of an iteration in a later stretch over one in the first: its contacts cost more."""
 BUILDING = 60.0
 """Time to build the worlds of a later stretch [s]."""
-USED = 0.97
+USED = 0.95
 """Share of the limit to fill."""
 
 
