@@ -16,6 +16,7 @@ from ..contract import (
     PolicyContract,
     standard_contract,
 )
+from .presets import fitting_presets
 
 AT_ONCE = 1.0
 """Time after standing within which a fall says that the policy is run wrongly [s]."""
@@ -31,9 +32,11 @@ def contract_for_width(
     frame = standard_contract(robot).frame_width
     frames, rest = divmod(width, frame)
     if rest or not 1 <= frames <= LONGEST_HISTORY:
+        fitting = ", ".join(fitting_presets(robot, width))
         raise PolicyError(
             f"'{source}' takes {width} values, which is no multiple of the standard observation's {frame}; "
             "give a contract.toml that describes its observation (gaitgauge contract new)"
+            + (f", or with --contract the preset of the code that trained it: {fitting}" if fitting else "")
         )
     history = History(length=frames, order=order if frames > 1 else "frame-major")
     assumed = f"{frames} frame(s) of the standard observation of {frame} entries, {history.order}; gains of the robot"

@@ -69,9 +69,12 @@ def sdk_joints(robot: Robot, order: Sequence[Any], source: object, entry: str) -
             "add sdk_joint_names to its robot.toml"
         )
     if sorted(order) != list(range(len(numbered))):
+        others = [name for name in robot_names() if load_robot(name).num_joints == len(order) != len(numbered)]
         raise PolicyError(
-            f"'{source}' has {entry} {list(order)}; every number from 0 to {len(numbered) - 1} is needed once for robot "
-            f"'{robot.name}' (--robot chooses another)"
+            f"'{source}' has {entry} {shown(list(order))}; every number from 0 to {len(numbered) - 1} is needed once for robot "
+            f"'{robot.name}'; "
+            + (f"'{others[0]}' has {len(order)} joints: " if others else "")
+            + "--robot chooses another"
         )
     return tuple(numbered[int(i)] for i in order)
 
