@@ -72,7 +72,9 @@ def test_sides_of_prisms_hold_a_sphere_and_do_not_lift_it():
     assert normals[:, 0].min() < -0.9 and normals[:, 0].max() > 0.9
 
 
-@pytest.mark.parametrize("motor_limits", [None, pytest.param("torque", marks=pytest.mark.slow), "speed"])
+@pytest.mark.parametrize(
+    "motor_limits", [*(pytest.param(limits, marks=pytest.mark.slow) for limits in (None, "torque")), "speed"]
+)
 def test_a_walk_over_the_wave(motor_limits):
     changes = Changes(motor_limits=motor_limits)
     walk = Walk("pretrained", make_terrain("wave", 1), robots=2, friction=0.7, seed=0, changes=changes)

@@ -81,14 +81,6 @@ def test_a_whole_run(request_for, tmp_path, base):
     assert sum(int(r["physics_steps"]) for r in rows) > 0
 
 
-def test_the_same_request_gives_the_same_results(whole_run, tmp_path):
-    request, once = whole_run
-    again = tmp_path / "run"
-    evaluate(replace(request, threads=2), again)
-    assert without_provenance(again) == without_provenance(once)
-    assert (again / "episodes.csv").read_bytes() == (once / "episodes.csv").read_bytes()
-
-
 @pytest.mark.parametrize("parallel", [True, False])
 def test_an_engine_from_outside_gets_the_workers_that_it_declares(whole_run, tmp_path, monkeypatch, parallel):
     request, once = whole_run

@@ -131,7 +131,7 @@ def assert_equal(records, others):
         assert one.samples.tobytes() == other.samples.tobytes()
 
 
-@pytest.mark.parametrize("name", [REFERENCE, OWN])
+@pytest.mark.parametrize("name", [pytest.param(REFERENCE, marks=pytest.mark.slow), OWN])
 def test_replayed_steps_give_the_same_records(name, tapes):
     script = FakeScript(motion=swaying, penetration_time=torch.tensor([0.1, 1e9, 0.16, 1e9, 0.2]))
     plain = play(name, interval=4, script=script)

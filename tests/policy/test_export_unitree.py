@@ -20,7 +20,7 @@ from gaitgauge.policy.native import NativePolicy
 from gaitgauge.robots import load_robot
 from gaitgauge.terrains.registry import make_terrain
 
-STEPS = 80
+STEPS = 50
 RUNTIME = "onnxruntime==1.16.0"
 RUN = """
 import sys, numpy, onnxruntime
@@ -64,7 +64,7 @@ class RecordedSession(PolicySession):
 
 
 def closed_loop(contract):
-    """Observations (80, 225) and actions (80, 12) of the pretrained policy walking over waves in MuJoCo."""
+    """Observations (``STEPS``, 225) and actions (``STEPS``, 12) of the pretrained policy walking over waves in MuJoCo."""
     policy = Recorded(contract)
     suite = load_suite("gaitgauge-1")
     settings = {"backend": "mujoco", "device": "cpu", "friction": 0.6, "seed": 0, "suite": suite}

@@ -33,17 +33,17 @@ def test_resumes_exactly_with_the_training_environment(tmp_path):
     whole, first, second = (tmp_path / name for name in ("whole", "first", "second"))
     for folder in (whole, first, second):
         folder.mkdir()
-    build(whole).learn(4)
-    build(first).learn(2)
+    build(whole).learn(2)
+    build(first).learn(1)
     resumed = build(second, seed=5)
-    resume_run(resumed, first / "model_2.pt")
-    resumed.learn(2)
-    a, b = (read_checkpoint(folder / "model_4.pt") for folder in (whole, second))
+    resume_run(resumed, first / "model_1.pt")
+    resumed.learn(1)
+    a, b = (read_checkpoint(folder / "model_2.pt") for folder in (whole, second))
     for name, value in a["actor_state_dict"].items():
         assert torch.equal(value, b["actor_state_dict"][name]), name
     for name, value in a["training"]["environment"]["memory"].items():
         assert torch.equal(value, b["training"]["environment"]["memory"][name]), name
-    assert load_policy(whole / "model_4.pt").contract.hash == resumed.contract.hash
+    assert load_policy(whole / "model_2.pt").contract.hash == resumed.contract.hash
 
 
 def test_the_algorithm_and_checkpoints_know_where_schedules_are(tmp_path):
