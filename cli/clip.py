@@ -4,19 +4,38 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import threading
 from collections.abc import Sequence
 from pathlib import Path
 
 from ..gauge.report.page import CLIP
 from ..gauge.result import Result
+from .errors import UserError
+from .picture import PLAIN, find_renderer
 
 SECONDS = 6.0
 """Length of the film [s]."""
 _LONGEST = 300.0
 """Longest time to make it [s]."""
+_PLAIN, _RICH, _NONE = 10.0, 4.0, 2.5
+"""Time of a film that a CPU draws, and a GPU, and until it is clear that nothing draws, on one core that does nothing else [s]."""
 _SHOWIEST = ("stairs_fd", "obstacle", "wave", "slope_fd", "stairs_bd", "slope_bd")
 """Terrains in the order of preference."""
 _PACKAGE = __name__.partition(".")[0]
+
+
+class FilmTime:
+    """Estimate the time of a film; a process beside the evaluation finds out how this machine draws."""
+
+    def __init__(self) -> None:
+        self.seconds = _PLAIN
+        threading.Thread(target=self._find, daemon=True).start()
+
+    def _find(self) -> None:
+        try:
+            self.seconds = _PLAIN if find_renderer()[1] is PLAIN else _RICH
+        except UserError:
+            self.seconds = _NONE
 
 
 def make_clip(folder: Path, result: Result, options: Sequence[str]) -> str | None:

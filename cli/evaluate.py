@@ -23,12 +23,11 @@ from ..gauge.suite import Suite
 from ..policy.contract import PolicyContract
 from ..policy.foreign.adapters import AT_ONCE, doubt
 from ..studies.naming import free_run_folder, run_folders
+from .clip import FilmTime
 from .console import Terminal, make_table, print_json
 from .progress import ProgressDisplay
 from .studies import resumable
 
-FILM_SECONDS, REPORT_SECONDS = 10.0, 1.0
-"""Time of the film and of results with their page on one core that does nothing else [s]."""
 SLOWER = (
     "the suite commands more than the policy was made for; 'gaitgauge play POLICY' stays within its limits, and a suite with "
     'commands.beyond = "clip" plays it there'
@@ -47,9 +46,10 @@ def run_evaluation(request: Request, *, out: Path | None, resume: bool, clip: bo
     quiet = redirect_stdout(io.StringIO() if request.cluster else sys.stdout)
     with resumable(console, "gauging", folder, "--resume") as display, quiet:
         command = ["gaitgauge", *sys.argv[1:]]
-        result = evaluate(prepared, folder, resume=resume, command=command, watch=shower(display, film=clip))
+        film = FilmTime() if clip else None
+        result = evaluate(prepared, folder, resume=resume, command=command, watch=shower(display, film))
         report = write_report(folder)
-        sentence = _film(display, folder, request, result) if clip else None
+        sentence = _film(display, film.seconds, folder, request, result) if film else None
         if clip and sentence is None:
             report = write_report(folder)  # with the film
     if sentence:
@@ -65,14 +65,14 @@ def run_evaluation(request: Request, *, out: Path | None, resume: bool, clip: bo
     console.say(f"results  {folder / 'results.json'}\nepisodes {folder / 'episodes.csv'}\nreport   {report}")
 
 
-def _film(display: ProgressDisplay, folder: Path, request: Request, result: Result) -> str | None:
-    """Film the robot for the report; return why there is no film."""
+def _film(display: ProgressDisplay, seconds: float, folder: Path, request: Request, result: Result) -> str | None:
+    """Film the robot for the report, which takes about so long; return why there is no film."""
     from .clip import make_clip
 
     options = [request.policy, "--suite", request.suite] + ["--trust"] * request.trust
     options += ["--robot", request.robot] if request.robot else []
     options += ["--contract", request.contract] if request.contract else []
-    display.update(1.0, "filming the robot", left=display.left)
+    display.update(1.0, "filming the robot", left=seconds)
     return make_clip(folder, result, options)
 
 
@@ -89,13 +89,13 @@ def doubtful_assumptions(contract: PolicyContract, suite: Suite, folder: Path, *
     return f"the robot fell at once in {sum(fell)} of {len(fell)} episodes: {advice}"
 
 
-def shower(display: ProgressDisplay, *, film: bool = False) -> Callable[[Status], None]:
-    """Return the function that shows the progress of an evaluation; ``film``: one is made afterwards."""
+def shower(display: ProgressDisplay, film: FilmTime | None = None) -> Callable[[Status], None]:
+    """Return the function that shows the progress of an evaluation; a film may be made afterwards."""
 
     def show(status: Status) -> None:
         left = status.seconds_left
-        if left is not None:
-            left += (REPORT_SECONDS + FILM_SECONDS * film) * max(status.slowness, 1.0)
+        if left is not None and film is not None:
+            left += film.seconds * max(status.slowness, 1.0)
         places = sorted({f"{e.terrain} L{e.level}" if e.level else e.terrain for e in status.active})
         running = ", ".join(places[:5]) + (f" and {len(places) - 5} more" if len(places) > 5 else "")
         text = f"{status.done} of about {status.expected} episodes"

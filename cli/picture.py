@@ -98,12 +98,17 @@ def choose_renderer() -> Quality:
     Raises:
         UserError: nothing draws.
     """
+    os.environ["MUJOCO_GL"], quality = find_renderer()
+    return quality
+
+
+def find_renderer() -> tuple[str, Quality]:
+    """Return the way to draw on this machine, a value of ``MUJOCO_GL``, and its quality. Raises UserError: nothing draws."""
     asked, ways = os.environ.get("MUJOCO_GL"), renderers()
     for name in (asked,) if asked else ways:
         driver, trouble = ask(PROBE, MUJOCO_GL=name)
         if not trouble:
-            os.environ["MUJOCO_GL"] = name
-            return PLAIN if name == "osmesa" or any(n in driver.lower() for n in _ON_THE_CPU) else RICH
+            return name, PLAIN if name == "osmesa" or any(n in driver.lower() for n in _ON_THE_CPU) else RICH
     named = {"egl": "EGL", "osmesa": "OSMesa", "cgl": "CGL", "wgl": "WGL"}
     failed = (
         f"neither {' nor '.join(named[w] for w in ways)} draws" if len(ways) > 1 else f"{named[ways[0]]} does not draw"

@@ -24,6 +24,8 @@ _COLUMNS = 4
 """Details side by side."""
 _LEAST = 1.0
 """Time that is shown where the estimate has run out [s]."""
+_CLOSING = 0.6
+"""Time of the page, the tables and the end of the process over that of the start: both load packages, read files and are Python's."""
 
 
 class ProgressDisplay:
@@ -38,6 +40,8 @@ class ProgressDisplay:
         self._began = self._told = self._updated = clock()
         self._share, self._text = 0.0, "starting"
         self._left: float | None = None
+        self.closing = 0.0
+        """Time that follows the work of which ``update`` tells the rest [s]."""
         self._details: Mapping[str, str] = {}
         self._live: Live | None = None
         self._lock, self._stop = threading.Lock(), threading.Event()
@@ -47,6 +51,7 @@ class ProgressDisplay:
         first, ProgressDisplay._first = self._first, None
         if first is not None:
             self._began, self._told = first._began, first._told
+            self.closing = _CLOSING * (self._clock() - self._began)
             first.close()
         self._open()
         return self
@@ -100,12 +105,12 @@ class ProgressDisplay:
 
         Args:
             share: of the work that is done, 0 to 1.
-            left: estimated time until the work ends [s]; None where there is no estimate.
+            left: estimated time until the work ends, ``closing`` not included [s]; None where there is no estimate.
             last: print a line in any case where there is no terminal.
         """
         with self._lock:
             self._share, self._text, self._details = share, text, details or {}
-            self._left, self._updated = left, self._clock()
+            self._left, self._updated = None if left is None else left + self.closing, self._clock()
         if self._live is None:
             self._tell(last=last)
 
@@ -119,12 +124,6 @@ class ProgressDisplay:
             more = "".join(f", {name} {printable(value)}" for name, value in self._details.items())
             line = f"{duration(now - self._began)}: {self._title}, {self._words(now)}{more}"
         self._console.say(line)
-
-    @property
-    def left(self) -> float | None:
-        """Return the time that is shown as left [s]; None where there is no estimate."""
-        with self._lock:
-            return None if self._left is None else self._left_at(self._clock())
 
     def _tell_now_and_then(self) -> None:
         while not self._stop.wait(_TICK):

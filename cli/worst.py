@@ -38,6 +38,7 @@ def run_worst(
     for engine in prepared.skipped:
         console.say(f"{engine['engine']} does not play failures again: {engine['reason']}")
     with resumable(console, "searching", folder, "--resume") as display:
+        display.closing = 0.0  # the budget holds all of it
         results = search_worst(
             prepared,
             folder,

@@ -8,7 +8,7 @@ from functools import partial
 
 from ...files.choices import cpu_threads
 from ...gauge.play.progress import ProgressMeter, Status
-from ...gauge.play.remaining import Cost
+from ...gauge.play.remaining import CPU_COST, Cost
 from ...gauge.suite import load_suite
 from ...terrains.registry import gauge_terrain_names
 from ..engine_pace import EnginePace, measure_all, measure_cost
@@ -58,7 +58,7 @@ class Budget:
 
     def _estimate(self, prepared: PreparedStudy, runs: list[Variant]) -> EnginePace:
         opened = [self._costs[v.label] for v in prepared.engines if v.label in self._costs]
-        after = sum(_OPEN_LOOP * (cost.loop + cost.world) + cost.start for cost in opened)
+        after = sum(_OPEN_LOOP * (cost.loop - CPU_COST.loop + cost.world) for cost in opened)
         return EnginePace(
             runs * len(prepared.policies),
             self._costs,

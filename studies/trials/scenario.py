@@ -30,6 +30,8 @@ _Angle = Annotated[float, Field(ge=-math.pi, le=math.pi)]
 _Spread = Annotated[float, Field(ge=0.0, le=10.0)]
 _Offset = Annotated[float, Field(ge=-2.0, le=2.0)]
 _Number = Annotated[int, Field(ge=0, le=1_000_000)]
+_KEPT = 0.85
+"""Speed over the commanded one that a walk to a place is expected to have, for the remaining time."""
 
 
 LONGEST = 3600.0
@@ -206,6 +208,17 @@ class Scenario:
     def seconds(self) -> float:
         """The longest that a trial can take [s]."""
         return sum(phase.seconds for phase in self.commands)
+
+    def usual_rest(self, spent: float, x: float) -> float:
+        """Return how long robots usually take on that are at ``x`` [m] after some time [s]: they keep part of the commanded speed."""
+        rest = 0.0
+        for leg in self.commands:
+            whole = max(leg.seconds - spent, 0.0)
+            if leg.until_x is not None and leg.velocity[0] > 0.0:
+                whole = min(whole, max(leg.until_x - x, 0.0) / (_KEPT * leg.velocity[0]))
+            rest += whole
+            spent = max(spent - leg.seconds, 0.0)
+        return rest
 
     @property
     def digest(self) -> str:

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from itertools import compress
 from pathlib import Path
 from statistics import median
 from typing import Any
 
-from ...backends.base import BackendError
+import torch
+
+from ...backends.base import BackendError, PhysicsState
 from ...backends.registry import choose_device, find_backend
 from ...files.choices import cpu_threads
 from ...files.provenance import provenance
@@ -24,10 +26,11 @@ from ...policy.contract import ContractError, PolicyContract
 from ...robots import RobotError
 from ...robots.anatomy.roles import anatomy
 from ..policies import describe, load_policies
-from ..turns import Turns, Watch
+from ..turns import Turns
+from ..turns import Watch as WatchTurns
 from .page import render_page
 from .request import ALL, TrialRequest
-from .running import Trial, run_scenario
+from .running import Trial, Watch, run_scenario
 from .scenario import Scenario, ScenarioError, load_scenario, scenario_names
 
 _LOOP = 3.0
@@ -37,7 +40,7 @@ MEASURES = ("reached", "progress", "mean_speed", "peak_speed", "speed_time", "tr
 
 
 def run_trials(
-    request: TrialRequest, folder: Path, *, command: Sequence[str] = (), watch: Watch = lambda _: None
+    request: TrialRequest, folder: Path, *, command: Sequence[str] = (), watch: WatchTurns = lambda _: None
 ) -> dict[str, Any]:
     """Send every policy through every scenario. What cannot be done is said under ``refused``; the rest is done.
 
@@ -72,7 +75,11 @@ def run_trials(
     turns = [(scenarios[entry["name"]], entry, label) for entry in entries for label in fits[entry["name"]]]
     repeats = [request.repeats or scenario.repeats for scenario, *_ in turns]
     told = Turns(
-        watch, [Stage(s.name, s.seconds * (_LOOP + n), s.name) for (s, *_), n in zip(turns, repeats, strict=True)]
+        watch,
+        [
+            Stage(s.name, s.usual_rest(0.0, s.start.x) * (_LOOP + n), s.name)
+            for (s, *_), n in zip(turns, repeats, strict=True)
+        ],
     )
     for scenario, entry, label in turns:
         told.begin(f"{label} in {scenario.name}")
@@ -104,10 +111,18 @@ def run_trials(
     return results
 
 
-def _steps(told: Turns, policy: Policy, scenario: Scenario) -> Callable[..., None]:
-    """Return the function that counts control steps of a scenario."""
-    steps, whole = itertools.count(1), scenario.seconds / policy.contract.control_period
-    return lambda *_: told.step(min(next(steps) / whole, 1.0))
+def _steps(told: Turns, policy: Policy, scenario: Scenario) -> Watch:
+    """Return the function that tells how far a scenario is: as far as its last robot that walks."""
+    steps, x = itertools.count(1), scenario.start.x
+
+    def step(state: PhysicsState, moving: torch.Tensor) -> None:
+        nonlocal x
+        spent = next(steps) * policy.contract.control_period
+        if bool(moving.any()):
+            x = float(state.base_position_w[moving, 0].min())
+        told.step(spent / (spent + scenario.usual_rest(spent, x)))
+
+    return step
 
 
 def _about(scenario: Scenario) -> dict[str, Any]:

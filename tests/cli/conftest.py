@@ -21,6 +21,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 def no_films(monkeypatch: pytest.MonkeyPatch) -> None:
     """Evaluations film nobody: it takes seconds, and not every machine can draw."""
     monkeypatch.setattr("gaitgauge.cli.clip.make_clip", lambda folder, results, options: None)
+    monkeypatch.setattr("gaitgauge.cli.clip.FilmTime._find", lambda self: None)
 
 
 @pytest.fixture

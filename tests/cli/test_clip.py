@@ -8,14 +8,14 @@ from pathlib import Path
 import pytest
 from gaitgauge.cli import clip
 from gaitgauge.cli.errors import UserError
-from gaitgauge.cli.picture import choose_renderer
+from gaitgauge.cli.picture import PLAIN, RICH, choose_renderer
 from gaitgauge.gauge.report.page import CLIP
 from gaitgauge.gauge.result import EnvironmentRow, read_result
 from gaitgauge.gauge.store import StoreError
 
 CARD = Path(__file__).parents[1] / "fuzz" / "seeds" / "results" / "results.json"
 RESULT = read_result(CARD, StoreError)
-make_clip = clip.make_clip  # the suite's fixture puts another in its place
+make_clip, find = clip.make_clip, clip.FilmTime._find  # the suite's fixture puts others in their place
 
 
 def rows(*places):
@@ -44,6 +44,23 @@ def test_machine_that_cannot_draw_says_so_in_one_sentence(tmp_path, monkeypatch)
     )
     (tmp_path / CLIP).write_bytes(b"made before")
     assert make_clip(tmp_path, rows(("flat", None, 0.6, 0.0)), ["pretrained"]) is None
+
+
+@pytest.mark.parametrize(
+    ("found", "seconds"), [(("egl", RICH), 4.0), (("osmesa", PLAIN), 10.0), (UserError("nothing draws"), 2.5)]
+)
+def test_the_time_of_a_film_is_that_of_how_the_machine_draws(monkeypatch, found, seconds):
+    """10 s were told on machines whose GPU draws it in 3 s, or that cannot draw."""
+
+    def find_renderer():
+        if isinstance(found, UserError):
+            raise found
+        return found
+
+    monkeypatch.setattr(clip, "find_renderer", find_renderer)
+    film = clip.FilmTime()
+    find(film)
+    assert film.seconds == seconds
 
 
 def test_evaluate_films_unless_told_otherwise(run, tmp_path, policy, monkeypatch):

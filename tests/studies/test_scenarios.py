@@ -66,6 +66,16 @@ def test_the_ground_of_the_shipped_scenarios_is_what_their_titles_say():
     assert stairs == pytest.approx([0.1, 0.6, 0.6, 0.45, 0.0])
 
 
+def test_a_walk_to_a_place_ends_long_before_its_limit():
+    """The 110 s that tile stairs allow were told as left, of which 40 s are needed."""
+    stairs, pull = load_scenario("tile-stairs"), load_scenario("lateral-pull")
+    assert stairs.usual_rest(0.0, 0.0) == pytest.approx(1 + 32.5 / (0.85 * 0.8) + 1)
+    assert stairs.usual_rest(31.0, 22.5) == pytest.approx(10 / (0.85 * 0.8) + 1)
+    assert stairs.usual_rest(101.0, 22.5) == pytest.approx(10 + 1), "its limit"
+    assert stairs.usual_rest(60.0, 33.0) == pytest.approx(1)
+    assert (pull.usual_rest(0.0, 0.0), pull.usual_rest(4.0, 1.5)) == (pull.seconds, pull.seconds - 4.0)
+
+
 def test_a_scenario_differs_in_its_digest_by_what_decides_about_outcomes_alone(tmp_path):
     own = load(tmp_path, OWN)
     assert load(tmp_path, OWN.replace("One's own", "Another title")).digest == own.digest
