@@ -10,7 +10,7 @@ from ..backends.base import PhysicsState
 from ..robots.base import Robot
 from .contract import RESTING, ContractError, ObservationTerm, PolicyContract, check_robot, held_joints
 from .ground import Ground, HeightScan
-from .observation_table import HEIGHT_SCAN, OBSERVATIONS, Observation, observation
+from .observation_table import ACTION_BEFORE_LAST, HEIGHT_SCAN, OBSERVATIONS, Observation, observation
 
 
 class ObservationBuilder:
@@ -73,6 +73,8 @@ class ObservationBuilder:
                 self._scans[i] = HeightScan(term, ground, num_episodes, contract.control_period)
         self._clock_offsets = [self._tensor(t.offsets) for t in contract.observation]
         self.clocks = torch.zeros(num_episodes, len(contract.observation), device=self.device)
+        remembered = any(term.name == ACTION_BEFORE_LAST for term in contract.observation)
+        self._shown = torch.zeros(num_episodes, len(index), device=self.device) if remembered else None
         places = tuple(place for places in contract.inputs.values() for place in places)
         as_kept = places == tuple(range(contract.frames * contract.frame_width))
         self._places = None if as_kept else self._tensor(places, torch.int64)
@@ -92,6 +94,8 @@ class ObservationBuilder:
         """Forget the past frames of the masked episodes, (N,) bool, None for all; their gait clocks begin anew."""
         for scan in self._scans.values():
             scan.reset(episodes)
+        if self._shown is not None:
+            self._shown.zero_() if episodes is None else self._shown.masked_fill_(episodes[:, None], 0.0)
         if episodes is None:
             self._frames.zero_()
             self.clocks.zero_()
@@ -136,6 +140,8 @@ class ObservationBuilder:
             for i, each in enumerate(self._observations)
         ]
         frame = torch.cat(blocks, dim=-1).to(torch.float32) * self._scale
+        if self._shown is not None:
+            self._shown.copy_(last_action)
         if self._limit is not None:
             frame = torch.clamp(frame, -self._limit, self._limit)
         return self._with_history(frame) if self.contract.frames > 1 else self._in_order(frame)
@@ -154,6 +160,8 @@ class ObservationBuilder:
             return self._phase(number, command)
         if made.name == "constant":
             return self._values[number]
+        if made.name == ACTION_BEFORE_LAST and self._shown is not None:
+            return self._shown
         value = self._scans[number](state) if number in self._scans else made.build(state, command, last_action)
         if made.name == "command" and self.contract.observation[number].values:
             value = torch.cat((value, self._values[number].to(value.dtype)), dim=1)

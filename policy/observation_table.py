@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
 GROUP = "gaitgauge.observations"
 HEIGHT_SCAN = "height_scan"
+ACTION_BEFORE_LAST = "action_before_last"
+"""The builder remembers it: the ``last_action`` of the control step before."""
 """Height of the base over the ground at points of a grid about it, which turns with the heading."""
 WITHOUT_WHEELS = "joint_pos_rel_without_wheel"
 """robot_lab's angles of joints, those of wheels being zero."""
@@ -206,6 +208,14 @@ _OWN = (
         unit="",
         mirror="joints",
         foreign_names=("last_action", "actions"),
+        policy_order=True,
+    ),
+    Observation(
+        name=ACTION_BEFORE_LAST,
+        build=lambda state, command, last_action: last_action,
+        width=None,
+        unit="",
+        mirror="joints",
         policy_order=True,
     ),
     Observation(

@@ -126,6 +126,20 @@ def test_the_last_action_is_shown_clipped(tmp_path):
     check(policy, standard, newest, simply(module), clip=0.8)
 
 
+def test_the_action_before_the_last_one(tmp_path):
+    """walk-these-ways shows two actions."""
+    module, seen = network(57), np.zeros((EPISODES, 12))
+    described(tmp_path, "action_clip = 0.05\n" + UNIT.replace("]\n", '{ name = "action_before_last" },\n]\n'))
+    policy = load_policy(script(tmp_path / "policy.pt", module))
+
+    def frame(step: Step, last: np.ndarray, age: int) -> list[np.ndarray]:
+        before = seen.copy() if age else np.zeros_like(seen)
+        seen[:] = last
+        return [*standard(step, last, age), before]
+
+    check(policy, frame, newest, simply(module), clip=0.05)
+
+
 # ---- several inputs, several files, a memory -------------------------------------------------------------------------
 
 

@@ -14,7 +14,7 @@ import torch
 from ...backends.base import PhysicsState
 from ...policy.contract import PolicyContract
 from ...policy.observation import ObservationBuilder
-from ...policy.observation_table import observation
+from ...policy.observation_table import ACTION_BEFORE_LAST, HEIGHT_SCAN, observation
 from ...robots.rotation import rotate_inverse
 from ...terrains.height_scan import HeightRasters, heading, place_pattern
 from .configuration import NoiseConfiguration, ObservationConfiguration
@@ -143,11 +143,12 @@ class Observer:
         self._settings, self._builder, self._scan, self._rasters = configuration, builder, scan, rasters
         self._torque_limit = torque_limit
         self._noise = noise_amplitude(contract, configuration.noise, scan.device)
-        self._start, self._sees_ground = contract.history.start, contract.scan_points > 0
+        self._start = contract.history.start
+        self._remembers = any(t.name in (HEIGHT_SCAN, ACTION_BEFORE_LAST) for t in contract.observation)
 
     def __call__(self, state: PhysicsState, memory: EnvironmentMemory, uniform: UniformColumns) -> Observations:
         """Observations; the noisy frame is added to the history."""
-        if self._sees_ground:
+        if self._remembers:
             self._builder.reset(memory.just_reset)
         clean = self._builder.build(state, memory.command, memory.action)
         noisy = clean + uniform.signed("noise") * self._noise
