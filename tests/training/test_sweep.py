@@ -368,9 +368,11 @@ def test_a_seed_of_the_gauge_that_is_easy_for_one_entry_counts_and_one_that_is_e
 
 def test_the_seeds_of_a_card_are_the_mean_of_its_entrys_runs():
     one = sample(suite="quick")
-    table = chance_of_seeds([one, one]).seeds[0]
+    both = chance_of_seeds([one, one], name="a")
+    table = both.seeds[0]
     assert table.shape[1] == len(one.chance.seeds) and table.sum(axis=1) == pytest.approx(0.0, abs=1e-9)
     assert np.array_equal(table, chance_of_seeds([one]).seeds[0])
+    assert both.levels.std() == chance_of_seeds([one], name="a").levels.std() > 0.0, "two runs find no surer levels"
 
 
 def test_entries_without_a_spread_are_not_compared():

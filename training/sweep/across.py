@@ -18,9 +18,10 @@ from ...gauge.totals import environment_weights
 from ...studies.compare.comparison import format_p, holm
 
 
-def chance_of_seeds(results: Sequence[Result]) -> Chance:
-    """Return what each of the gauge's seeds adds to the mean score of an entry's runs, which all met the same seeds. The level searches are
-    left out: the spread over the seeds of training has them.
+def chance_of_seeds(results: Sequence[Result], *, name: str = "") -> Chance:
+    """Return what the gauge's seeds add to the mean score of an entry's runs, which all met the same seeds: the mean of their deviations at
+    each quality seed, and the level searches of the first run, since more runs on the same search seeds make the levels no surer. ``name``
+    is the entry's.
     """
     order = {row.key: at for at, row in enumerate(results[0].environments)}
     weights = environment_weights([row.terrain for row in results[0].environments])
@@ -29,7 +30,7 @@ def chance_of_seeds(results: Sequence[Result]) -> Chance:
         rows = [replace(row, trials={}) for row in sorted(result.environments, key=lambda row: order[row.key])]
         found.append(Evidence(rows, result.chance).chance(weights).seeds)
     tables = tuple(np.mean(tables, axis=0) for tables in zip(*found, strict=True))
-    return Chance(levels=np.zeros(1), seeds=tables)
+    return replace(Evidence(results[0].environments, results[0].chance, name=name).chance(weights), seeds=tables)
 
 
 def across_seeds(
@@ -37,9 +38,10 @@ def across_seeds(
 ) -> list[dict[str, Any]]:
     """Compare the entries' mean scores over their seeds of training, corrected for many looks by Holm.
 
-    The variance of a difference has three parts, with Welch and Satterthwaite's degrees of freedom: the spread of each entry's runs over
-    their number, and the spread of the difference over the gauge's seeds. All runs met the same seeds of the gauge, so a seed that is
-    easy for all cancels, and one that is easy for one entry counts: without this part a difference on shared seeds looks surer than it is.
+    The variance of a difference is the sum of three: the spread of each entry's runs over their number, the spread of the difference over
+    the gauge's quality seeds, and the chance in both level searches, with Welch and Satterthwaite's degrees of freedom. All runs met the
+    same seeds of the gauge: a seed that is easy for all cancels, and one that is easy for one entry counts. Without the gauge's part a
+    difference on shared seeds looks surer than it is.
 
     Args:
         scores: of each entry's runs. An entry with one run has the pooled spread of the others; one with the same score in all runs says

@@ -110,7 +110,7 @@ def _gauge_seeds(rows: Sequence[Mapping[str, Any]], folder: Path) -> dict[str, C
     for row in rows:
         if row["results"] is not None:
             cards.setdefault(row["entry"], []).append(read_result(folder / row["results"], SweepError))
-    return {name: chance_of_seeds(own) for name, own in cards.items()}
+    return {name: chance_of_seeds(own, name=name) for name, own in cards.items()}
 
 
 def _entry(name: str, rows: Sequence[Mapping[str, Any]], refused: str | None) -> dict[str, Any]:
