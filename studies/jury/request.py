@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated
 
-from ...files.choices import PLACE, PLAYED, Choice, PolicyNames, RobotName, ThreadCount, Trust
+from ...files.choices import PLACE, PLAYED, Choice, ContractName, PolicyNames, RobotName, ThreadCount, Trust
 
 ENGINES = ("mujoco", "mujoco@foot_condim=3", "newton:steel", "drake", "physx")
 """One engine of each family, and MuJoCo with feet that turn freely."""
@@ -54,6 +54,7 @@ class JuryRequest:
     """Each as ``parse_variant`` reads it. Empty: those of ``ENGINES`` that are installed."""
     part: Annotated[str, Choice(_PART, PLAYED, tuple(PARTS))] = "short"
     robot: RobotName = None
+    contract: ContractName = None
     device: Annotated[str | None, Choice(_DEVICE, PLACE)] = None
     threads: ThreadCount = None
     trust: Trust = False

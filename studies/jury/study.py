@@ -99,7 +99,9 @@ def prepare_jury(request: JuryRequest) -> PreparedJury:
     part = PARTS[request.part]
     suite = load_suite(part.suite)
     engines, skipped = _engines(request, suite)
-    policies, refused = load_policies(request.policies, request.robot, trust=request.trust)
+    policies, refused = load_policies(
+        request.policies, request.robot, trust=request.trust, contract_file=request.contract
+    )
     if refused:
         raise JuryError(f"'{one_line(refused[0]['what'])}' cannot be judged: {refused[0]['reason']}")
     first, *others = policies

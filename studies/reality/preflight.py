@@ -13,7 +13,7 @@ import numpy as np
 from ...files.provenance import provenance
 from ...files.writing import json_text, write_files
 from ...policy.contract import PolicyContract, check_robot
-from ...policy.loading import load_policy
+from ...policy.loading import load_policy, own_contract
 from ...policy.robot_of import robot_for
 from ...robots import Robot
 from .log import Array, Log, LogError
@@ -48,7 +48,9 @@ def preflight(request: PreflightRequest, folder: Path, *, command: Sequence[str]
         PolicyError, ContractError, RobotError: nor the policy, or it is for another robot.
     """
     began = time.perf_counter()
-    policy = load_policy(request.policy, trust=request.trust)
+    policy = load_policy(
+        request.policy, trust=request.trust, contract_file=own_contract(request.policy, request.contract)
+    )
     robot = robot_for(policy.contract, request.robot)
     log = read_logs([request.log], _with_robot(request, robot.name))[0]
     if log.robot.name != robot.name:

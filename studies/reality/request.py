@@ -8,7 +8,7 @@ from typing import Annotated
 
 from annotated_types import Ge, Le
 
-from ...files.choices import PLACE, PLAYED, Choice, DeviceName, PolicyName, ThreadCount, Trust
+from ...files.choices import PLACE, PLAYED, Choice, ContractName, DeviceName, PolicyName, ThreadCount, Trust
 
 _LOGS = "Logs of a robot (.npz, .csv, .mcap; docs/reference/logs.md)."
 _ROBOT = "Robot name, or a robot.toml. Default: the robot that the log is of."
@@ -68,4 +68,5 @@ class PreflightRequest(LogOptions):
 
     policy: PolicyName
     log: Annotated[Path, Choice("Log of the robot, hung up or standing.", metavar="LOG")]
+    contract: ContractName = None
     trust: Trust = False

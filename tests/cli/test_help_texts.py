@@ -73,6 +73,12 @@ def test_every_command_stands_in_a_group():
     assert len(grouped) == len(set(grouped))
 
 
+def test_every_command_that_takes_a_policy_takes_its_description():
+    for words, command in COMMANDS.items():
+        if {"policy", "policies"} & {each.name for each in command.params}:
+            assert "--contract" in [name for each in command.params for name in each.opts], words
+
+
 def test_long_helps_are_grouped():
     page = CliRunner().invoke(app, ["train", "-h"]).output
     assert "What is written" in page
