@@ -107,7 +107,7 @@ class EnginePace:
         self._suite, self._episodes, self._costs, self._runs = suite, episodes, costs, runs
         self.lengths = Lengths(suite)
         self._threads, self._usual = threads, next(iter(costs.values()), CPU_COST)
-        self._stages = Stages([*(Stage(v.label, self.seconds(v), _kind(v)) for v in runs), Stage("", after)])
+        self._stages = Stages([*(Stage(v.label, self.seconds(v), v.backend) for v in runs), Stage("", after)])
         self._number, self._began, self._clock = -1, 0.0, time.perf_counter
         self._first: float | None = None
         self.seconds_left = self._stages.left(0.0) or 0.0
@@ -140,10 +140,6 @@ class EnginePace:
     def end(self, *, counts: bool) -> None:
         """End the run at work; ``counts``: it played all episodes, none were there before."""
         self._stages.end(self._clock(), counts=counts)
-
-
-def _kind(variant: Variant) -> str:
-    return variant.backend
 
 
 def measure_all(

@@ -33,7 +33,7 @@ from pydrake.multibody.plant import AddMultibodyPlant, CoulombFriction, Multibod
 from pydrake.multibody.tree import FixedOffsetFrame, RevoluteJoint, RigidBody, SpatialInertia, UnitInertia
 from pydrake.systems.framework import Diagram, DiagramBuilder
 
-from ...terrains.base import HeightField, Terrain
+from ...terrains.base import Terrain
 from ..base import Scene
 from ..sequential import RobotModel, Shape
 from .hydroelastic import FOOT_RESOLUTION, RESOLUTION, field_mesh, modulus, thickness
@@ -127,7 +127,8 @@ def build_plant(scene: Scene, robot: RobotModel, terrain: Terrain) -> Plant:
         place = pose(box.center, box.quaternion)
         ground[register(plant.world_body(), f"box_{number}", place, size, None)] = not box.wall
     if terrain.height_field is not None:
-        ground[register(plant.world_body(), "field", RigidTransform(), _field(terrain.height_field), None)] = True
+        field = Mesh(InMemoryMesh(mesh_file=MemoryFile(field_mesh(terrain.height_field), ".obj", "field.obj")))
+        ground[register(plant.world_body(), "field", RigidTransform(), field, None)] = True
     plant.Finalize()
     _filter(scene_graph, robot, list(shape_of))
     diagram = builder.Build()
@@ -197,11 +198,6 @@ def _drake_shape(shape: Shape) -> Any:
         case "box":
             return Box(2.0 * a, 2.0 * b, 2.0 * c)
     return Convex(shape.vertices.T, shape.name)
-
-
-def _field(field: HeightField) -> Mesh:
-    """Return a height field as a closed mesh."""
-    return Mesh(InMemoryMesh(mesh_file=MemoryFile(field_mesh(field), ".obj", "field.obj")))
 
 
 def _filter(scene_graph: SceneGraph, robot: RobotModel, geometries: list[GeometryId]) -> None:

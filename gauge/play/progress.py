@@ -219,10 +219,11 @@ class ProgressMeter:
             chain, mine, single = 0.0, 0.0, 0.0
             for stage in ("search", "eval"):
                 each = [self._rest(e, active.get(e)) for e in found.required if e.stage == stage]
-                mine += sum(steps for _, steps in each)
+                own = [steps for _, steps in each]
+                mine += sum(own)
                 chain += max((loops for loops, _ in each), default=0.0)
                 # tests share a worker; each quality episode has one
-                single += (sum if stage == "search" else _largest)([steps for _, steps in each])
+                single += sum(own) if stage == "search" else max(own, default=0.0)
             possible = {e: p for e, p in found.possible.items() if e.stage == "search"}
             if possible:
                 length, counted = (
@@ -302,7 +303,3 @@ def watcher(meter: ProgressMeter, watch: Callable[[Status], None]) -> Callable[[
             next_time = time.perf_counter() + _WATCH_INTERVAL
 
     return on_progress
-
-
-def _largest(values: Sequence[float]) -> float:
-    return max(values, default=0.0)

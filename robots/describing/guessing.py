@@ -53,7 +53,7 @@ def guessed_again(path: Path) -> tuple[str, list[str], Path]:
         old = values.pop(entry.key, None)
         if old is None or entry.key in ("name", "title", "mjcf"):
             entries.append(entry if old is None else Entry(entry.key, old))
-        elif entry.key in mine or _same(old, entry.value):
+        elif entry.key in mine or tag_of(old) == tag_of(entry.value):
             entries.append(replace(entry, value=old, remark=_remark(entry.key, mine, remarks)))
         else:
             entries.append(entry)
@@ -65,10 +65,6 @@ def guessed_again(path: Path) -> tuple[str, list[str], Path]:
 
 def _remark(key: str, mine: set[str], remarks: Mapping[str, tuple[str, str]]) -> str:
     return "" if key in mine or key not in remarks else remarks[key][0]
-
-
-def _same(old: Any, new: Any) -> bool:
-    return tag_of(old) == tag_of(new)
 
 
 def _short(value: Any) -> str:

@@ -38,7 +38,7 @@ def differences(given: PolicyContract, wanted: PolicyContract, robot: Robot) -> 
     found = []
     if given.joint_names != wanted.joint_names:
         moved = partial(reordered, joint_names=wanted.joint_names)
-        stays = partial(_renamed, names=wanted.joint_names)
+        stays = partial(replace, joint_names=wanted.joint_names)
         apply = min((moved, stays), key=lambda order: len(_values(order(given), wanted)))
         text = joint_order_text(robot, wanted.joint_names)
         if apply is stays:
@@ -46,10 +46,6 @@ def differences(given: PolicyContract, wanted: PolicyContract, robot: Robot) -> 
         found.append(Change(kind="joint order", text=text, apply=apply))
         given = apply(given)
     return found + _values(given, wanted)
-
-
-def _renamed(contract: PolicyContract, names: tuple[str, ...]) -> PolicyContract:
-    return replace(contract, joint_names=names)
 
 
 def _values(given: PolicyContract, wanted: PolicyContract) -> list[Change]:

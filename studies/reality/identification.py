@@ -193,7 +193,7 @@ class _Problem:
         parts = []
         for number, (log, rows) in enumerate(zip(self.logs, self.rows, strict=True)):
             series = self.simulate(guesses, number, nominal=nominal)
-            short = _rows_of(log, rows)
+            short = replace(log, time=log.time[rows])
             for recorded, simulated in ((log.position, series[0]), (log.torque, series[2])):
                 if recorded is not None:
                     parts.append((at_rows(short, simulated) - recorded[rows]).reshape(len(guesses), -1))
@@ -267,10 +267,6 @@ def _chosen(log: Log) -> NDArray[np.int64]:
     rows = np.flatnonzero(log.fresh & (log.time >= SETTLING))
     every = max(round(1.0 / (_ROWS_PER_SECOND * log.period)), 1)
     return rows[::every]
-
-
-def _rows_of(log: Log, rows: NDArray[np.int64]) -> Log:
-    return replace(log, time=log.time[rows])
 
 
 def identify(

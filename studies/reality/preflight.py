@@ -52,7 +52,7 @@ def preflight(request: PreflightRequest, folder: Path, *, command: Sequence[str]
         request.policy, trust=request.trust, contract_file=own_contract(request.policy, request.contract)
     )
     robot = robot_for(policy.contract, request.robot)
-    log = read_logs([request.log], _with_robot(request, robot.name))[0]
+    log = read_logs([request.log], replace(request, robot=request.robot or robot.name))[0]
     if log.robot.name != robot.name:
         raise LogError(f"log '{log.name}' is of robot '{log.robot.name}', but the policy is for '{robot.name}'")
     findings = list(checks(log, policy.contract))
@@ -75,10 +75,6 @@ def _pose_of(contract: PolicyContract, robot: Robot) -> Array:
     pose = np.array(robot.default_joint_position)
     pose[list(check_robot(contract, robot))] = contract.action_offset or contract.default_joint_position
     return pose
-
-
-def _with_robot(request: PreflightRequest, robot: str) -> PreflightRequest:
-    return replace(request, robot=request.robot or robot)
 
 
 def checks(log: Log, contract: PolicyContract) -> Iterator[Finding]:

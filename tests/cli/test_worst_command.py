@@ -20,7 +20,7 @@ def late_ones_fall(monkeypatch):
     monkeypatch.setattr("time.perf_counter", itertools.count().__next__)
 
 
-def test_table_sentences_and_files(run, policy, late_ones_fall, tmp_path):
+def test_table_sentences_and_files(run, refused, policy, late_ones_fall, tmp_path):
     result = run("worst", policy, *WORDS)
     assert result.exit_code == 0, result.output
     text = " ".join(result.output.split())
@@ -29,12 +29,11 @@ def test_table_sentences_and_files(run, policy, late_ones_fall, tmp_path):
     assert [failure["factors"] for failure in results["failures"]] == [["latency"]]
     assert (tmp_path / "out" / "worst.html").is_file()
     assert (tmp_path / "out" / "scenarios" / "worst-01.toml").is_file()
+    assert "already holds this search; go on with --resume" in refused("worst", policy, *WORDS)
     again = run("worst", policy, *WORDS, "--resume", "--json")
     assert json.loads(again.stdout)["failures"] == results["failures"]
 
 
-def test_what_cannot_be_searched_is_refused(run, refused, policy, late_ones_fall):
+def test_what_cannot_be_searched_is_refused(refused, policy):
     assert "nobody.pt" in refused("worst", "nobody.pt", *WORDS)
     assert "unknown backend 'bullet'" in refused("worst", policy, "--others", "bullet")
-    assert run("worst", policy, *WORDS).exit_code == 0
-    assert "already holds this search; go on with --resume" in refused("worst", policy, *WORDS)

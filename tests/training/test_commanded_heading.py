@@ -72,21 +72,15 @@ def test_an_episode_sets_out_from_the_heading_of_its_start():
 
 
 @pytest.mark.parametrize(
-    ("along", "holds", "way"),
-    [
-        ("command", True, 0.78),
-        ("command", False, 0.78),
-        ("straight", True, 0.78),
-        ("straight", False, 0.5),  # half a circle
-        ("base", True, 0.5),
-    ],
+    ("along", "held", "free"),
+    [("command", 0.78, 0.78), ("straight", 0.78, 0.5), ("base", 0.5, 0.5)],  # 0.5: half a circle
 )
-def test_progress_may_be_counted_along_whichever_way_the_robot_heads(along, holds, way):
+def test_progress_may_be_counted_along_whichever_way_the_robot_heads(along, held, free):
     environment = make(4, script=gliding(0.0, 0.0, 4.0), rewards=RewardConfiguration(progress_along=along))
     memory, _ = commanded(environment, 1.0, 0.0)
-    memory.holds_heading.fill_(holds)
+    memory.holds_heading.copy_(torch.tensor([True, True, False, False]))
     idle(environment, 39)
-    assert float(memory.commanded_way.norm(dim=1)[0]) == pytest.approx(way, abs=0.02)
+    assert memory.commanded_way.norm(dim=1).tolist() == pytest.approx([held, held, free, free], abs=0.02)
 
 
 @pytest.mark.parametrize(

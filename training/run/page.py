@@ -55,7 +55,7 @@ def _render(run: Path, scores: str | None, scalars: Mapping[str, float]) -> str:
         report=None if folder is None else f"{folder.relative_to(run).as_posix()}/report.html",
         rows=[] if result is None else [_row(row) for row in result.environments],
         ends={key.removeprefix(_ENDS): value for key, value in scalars.items() if key.startswith(_ENDS)},
-        films=[(_terrain_of(film), base64.b64encode(film.read_bytes()).decode()) for film in last],
+        films=[(film.stem.split("_", 2)[2], base64.b64encode(film.read_bytes()).decode()) for film in last],
     )
 
 
@@ -63,10 +63,6 @@ def _last_score(gauge: Path) -> Path | None:
     """Return the folder of the last checkpoint with results."""
     found = [path.parent for path in gauge.glob("*/model_*/results.json")]
     return max(found, key=lambda folder: int(folder.name.removeprefix("model_")), default=None)
-
-
-def _terrain_of(film: Path) -> str:
-    return film.stem.split("_", 2)[2]
 
 
 def _row(row: EnvironmentRow) -> dict[str, Any]:
