@@ -22,8 +22,9 @@ from .segments import AtWork
 
 _WATCH_INTERVAL = 0.2
 """Shortest time between two calls of ``watch`` [s]."""
-_SEARCHES = {"bisection": (4.3, 3.0, 1.0), "curve": (5.2, 3.8, 1.9), "area": (2.0, 4.8, 1.95)}
-"""Of a usual search: rounds of tests, one after another; tests over search seeds; levels at which quality is evaluated."""
+_SEARCHES = {"bisection": (4.3, 1.0, 1.0), "curve": (5.2, 1.9, 0.75), "area": (2.0, 1.95, 1.0)}
+"""Of a usual search: rounds of tests, one after another; levels at which quality is evaluated; tests that are played over those that
+the plan takes for likely."""
 _FORMER = 2.0
 """Weight of what was expected, in episodes or searches."""
 _EASY = 8.0
@@ -180,8 +181,7 @@ class ProgressMeter:
         self.lengths = lengths or Lengths(suite)
         self.pace = Pace(expected)
         self._suite, self._began = suite, began
-        rounds, tests, self._levels = _SEARCHES[suite.scoring.level]
-        self._search = rounds, tests * len(suite.matrix.search_seeds)
+        self._rounds, self._levels, self._kept = _SEARCHES[suite.scoring.level]
 
     def look(self, playing: Playing, now: float | None = None) -> Status:
         """Return the progress of the evaluation; ``now``: value of ``time.perf_counter()``, None for the present one."""
@@ -213,7 +213,7 @@ class ProgressMeter:
         Args:
             worlds: of each worker.
         """
-        rounds, usual = self._usual_search(plans)
+        rounds = self._usual_rounds(plans)
         total, longest, alone, more = 0.0, 0.0, 0.0, 0.0
         for found in plans:
             chain, mine, single = 0.0, 0.0, 0.0
@@ -231,7 +231,7 @@ class ProgressMeter:
                     [e for e in found.counted if e.stage == "search"],
                 )
                 ahead = min(max(rounds - self._played(counted), 0.5), len({e.level for e in possible}))
-                tests = min(max(usual - len(counted), ahead), 0.8 * len(possible))
+                tests = self._kept * sum(possible.values())
                 if possible.keys() <= active.keys() | self.lengths.seen:  # all of them have begun already
                     chain = max(chain, *(self._rest(e, active[e])[0] for e in possible if e in active), 0.0)
                 else:
@@ -279,17 +279,15 @@ class ProgressMeter:
             return 1 if len(tests) <= self._suite.scoring.levels else 2
         return max(len({e.level for e in tests}), 1)
 
-    def _usual_search(self, plans: Sequence[Plan]) -> tuple[float, float]:
-        """Return the rounds and the tests that searches usually have, from those that have found their level, too."""
-        rounds, tests = (_FORMER * usual for usual in self._search)
-        weight = _FORMER
+    def _usual_rounds(self, plans: Sequence[Plan]) -> float:
+        """Return the rounds of tests that searches usually have, from those that have found their level, too."""
+        rounds, weight = _FORMER * self._rounds, _FORMER
         for found in plans:
             mine = [e for e in found.counted if e.stage == "search"]
             if mine and not found.possible and not any(e.stage == "search" for e in found.required):
                 rounds += self._played(mine) + (self._suite.scoring.level != "area")
-                tests += len(mine)
                 weight += 1.0
-        return rounds / weight, tests / weight
+        return rounds / weight
 
 
 def watcher(meter: ProgressMeter, watch: Callable[[Status], None]) -> Callable[[Playing], None]:

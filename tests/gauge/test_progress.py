@@ -123,8 +123,8 @@ KINDS = {
     "eight cores": ("quick", 8, 24, CORES, Speculation(at_work=128)),
     "a GPU": ("quick", 1, 4096, CARD, Speculation(at_work=4096, test_probability=0.02, quality_probability=0.25)),
 }
-CASES = [("two cores", 4.0), ("a GPU", 7.0)]
-RARER = [(kind, strength) for kind in KINDS for strength in (4.0, 7.0, 9.5) if (kind, strength) not in CASES]
+CASES = [("two cores", 11.0), ("a GPU", 7.0)]
+RARER = [(kind, strength) for kind in KINDS for strength in (4.0, 7.0, 9.5, 11.0) if (kind, strength) not in CASES]
 
 
 @pytest.mark.parametrize(("kind", "strength"), CASES + [pytest.param(*c, marks=pytest.mark.slow) for c in RARER])
