@@ -215,12 +215,14 @@ class ProgressMeter:
         """
         rounds = self._usual_rounds(plans)
         total, longest, alone, more = 0.0, 0.0, 0.0, 0.0
+        whole: list[float] = []  # quality episodes, of which each has one worker
         for found in plans:
             chain, mine, single = 0.0, 0.0, 0.0
             for stage in ("search", "eval"):
                 each = [self._rest(e, active.get(e)) for e in found.required if e.stage == stage]
                 own = [steps for _, steps in each]
                 mine += sum(own)
+                whole += own if stage == "eval" else []
                 chain += max((loops for loops, _ in each), default=0.0)
                 # tests share a worker; each quality episode has one
                 single += sum(own) if stage == "search" else max(own, default=0.0)
@@ -250,6 +252,7 @@ class ProgressMeter:
                 chain += passed * sum(loops for loops, _ in each) / len(each)
                 more += evaluated
             total, longest, alone = total + mine, max(longest, chain), max(alone, single)
+        alone = max(alone, sum(sorted(whole, reverse=True)[::workers]))
         uneven = _UNEVEN if any(found.possible for found in plans) else 1.0
         share, longest, alone = (uneven * v for v in (total / workers, longest, alone))
         return Work(loops=max(longest, share / worlds), world_steps=max(share, alone)), more
