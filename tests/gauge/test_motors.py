@@ -3,12 +3,10 @@
 from dataclasses import replace
 
 import pytest
-from gaitgauge.gauge.coverage import notes, score_label
 from gaitgauge.gauge.motors import gains_note, joint_parameters
 from gaitgauge.gauge.suite import load_suite
 from gaitgauge.policy.contract import ContractError, ObservationTerm, kind_of_observations, standard_contract
 from gaitgauge.robots import RobotError
-from sample_results import sample
 from scripted_gauge import GO2
 
 OWN, REFERENCE = load_suite("gaitgauge-1"), load_suite("robogauge-1.1")
@@ -60,18 +58,12 @@ def test_a_robot_without_the_suite_s_parameters_is_one_sentence():
 # ---- what a robot can measure -----------------------------------------------------------------------------------------
 
 
-def test_a_base_linear_velocity_makes_a_score_privileged():
-    """It was read exactly, without noise and without a mark."""
+def test_a_base_linear_velocity_is_privileged():
+    """It was read exactly, without noise and without a mark; ``test_cheats.py`` has the name of its score."""
     told = replace(
         USUAL, observation=(ObservationTerm(name="base_linear_velocity_b", scale=(2.0,)), *USUAL.observation)
     )
     assert (kind_of_observations(USUAL), kind_of_observations(told)) == ("measurable", "privileged")
-    whole = sample(suite="gaitgauge-1")
-    observations = tuple(t.name for t in told.observation)
-    policy = replace(whole.policy, kind_of_observations="privileged", observations=observations)
-    result = replace(whole, policy=policy)
-    assert score_label(result) == "privileged score"
-    assert notes(result) == ["privileged observations: no sensor of a robot measures base_linear_velocity_b"]
 
 
 @pytest.mark.parametrize("name", ["base_height", "foot_contact_force", "friction"])

@@ -218,14 +218,14 @@ def test_being_stuck_lowers_the_level():
 
 def test_who_was_told_to_stand_is_not_stuck():
     environment = make(4, terrain=STAIRS, commands=forward_at(0.0), termination=STUCK)
-    assert not any(bool(idle(environment)[2].any()) for _ in range(75))
+    assert not any(bool(idle(environment)[2].any()) for _ in range(60))
 
 
 def test_no_robot_is_stuck_on_a_tile_that_does_not_say_so():
     free = replace(STAIRS, tiles=(STAIRS.tiles[0], replace(STAIRS.tiles[1], stuck=False)))
     environment = make(8, terrain=free, commands=forward_at(0.5), termination=STUCK)
     ended = torch.zeros(8, dtype=torch.bool)
-    for _ in range(75):
+    for _ in range(55):
         ended |= idle(environment)[2].bool()
     assert ended.tolist() == [environment.palette.tiles[kind].stuck for kind in environment.kind.tolist()]
     assert 0 < ended.sum() < 8
@@ -238,7 +238,7 @@ def test_being_stuck_ends_nothing_before_its_time_in_the_run():
         terrain=STAIRS,
         commands=forward_at(0.5),
         termination=later,
-        schedule=ScheduleConfiguration(horizon_steps=160),
+        schedule=ScheduleConfiguration(horizon_steps=120),
     )
-    ends = [bool(idle(environment)[2].any()) for _ in range(85)]
-    assert ends.index(True) == 79, "half of the run"
+    ends = [bool(idle(environment)[2].any()) for _ in range(65)]
+    assert ends.index(True) == 59, "half of the run"
