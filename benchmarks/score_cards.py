@@ -45,6 +45,8 @@ from gaitgauge.studies.policies import file_digest
 NAMES = ("standing", "trotting", "cts", *shipped_policies())
 ZOO = {known.name: known for known in zoo().values() if known.robot == "go2"}
 SUITES = ("robogauge-1.1", "gaitgauge-1")
+OWN_SUITES = {"pretrained-g1": ("gaitgauge-biped-1",)}
+"""Suites of policies for other legs than four."""
 
 
 def make_policy(name: str, path: Path, cts: Path | None) -> None:
@@ -139,7 +141,7 @@ def main() -> None:
     parser.add_argument("--made", action="store_true", help="take the results that the folder holds, play nothing")
     parser.add_argument("--commit", help="commit of the source that played, where the results do not know it")
     parser.add_argument("--only", nargs="+", choices=(*NAMES, *ZOO))
-    parser.add_argument("--suite", nargs="+", default=list(SUITES))
+    parser.add_argument("--suite", nargs="+", help="default: those of the cards that ship")
     parser.add_argument("--terrain", action="append", default=[])
     parser.add_argument("--friction", action="append", type=float, default=[])
     arguments = parser.parse_args()
@@ -154,7 +156,7 @@ def main() -> None:
     arguments.folder.mkdir(parents=True, exist_ok=True)
     arguments.out.mkdir(parents=True, exist_ok=True)
     for name in arguments.only:
-        for suite in arguments.suite:
+        for suite in arguments.suite or OWN_SUITES.get(name, SUITES):
             run = arguments.folder / f"{name}-{suite}"
             result = load_result(run) if arguments.made else play(name, suite, run, arguments)
             card = card_of(result, name, repeated, arguments.commit)
