@@ -44,29 +44,8 @@ _CLONE_THREAD = 0x10000
 # that always fail. The latter change files or their names and rights, start programs, open sockets, reach into other processes or
 # the kernel, and change limits, users, keys, mounts, clocks and modules.
 _SAME_EVERYWHERE = (
-    424,
-    425,
-    426,
-    427,
-    428,
-    429,
-    430,
-    431,
-    432,
-    433,
-    434,
-    437,
-    438,
-    440,
-    442,
-    443,
-    448,
-    452,
-    460,
-    463,
-    466,
-    467,
-)
+    424, 425, 426, 427, 428, 429, 430, 431, 432, 433, 434, 437, 438, 440, 442, 443, 448, 452, 460, 463, 466, 467,
+)  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
