@@ -154,7 +154,7 @@ def test_gains_that_make_torques_jump_are_named(monkeypatch):
         return [a for a in alternatives(contract, robot) if a.contract.hash == GOOD.hash]
 
     monkeypatch.setattr(diagnosis, "alternatives", right)
-    found = diagnose(described_as(BROKEN["gains"]), GO2, seconds=1.0)
+    found = diagnose(described_as(BROKEN["gains"]), GO2, seconds=2.0)
     assert found.described.survival == 1.0
     assert [m.kind for m in found.mistakes] == ["gains"]
     assert found.best.smoothness > found.described.smoothness + 0.1
