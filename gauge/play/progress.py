@@ -33,6 +33,8 @@ _AGAIN = 1.2
 """Length of a quality episode over the usual one where a penetration begins a goal again."""
 _SETTLING = 0.1
 """Share of the time up to its limit that the longest segment of an episode takes on beyond the usual length."""
+_SLOWEST = 0.45
+"""The same for the slowest of many episodes that are played side by side, beyond that of one."""
 _UNEVEN = 1.1
 """Time of a search over that of its tests played without a wait."""
 _OVERTIME = 0.35
@@ -224,6 +226,9 @@ class ProgressMeter:
                 mine += sum(own)
                 whole += own if stage == "eval" else []
                 chain += max((loops for loops, _ in each), default=0.0)
+                if stage == "eval" and own:  # the more episodes, the surer it is that one settles for long
+                    length = self.lengths.of(found.required[-1])
+                    chain += _SLOWEST * (1.0 - (1.0 - _SETTLING) ** (len(own) - 1)) * (length.limit - length.longest)
                 # tests share a worker; each quality episode has one
                 single += sum(own) if stage == "search" else max(own, default=0.0)
             possible = {e: p for e, p in found.possible.items() if e.stage == "search"}
