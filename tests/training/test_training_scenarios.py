@@ -5,8 +5,10 @@ from unittest.mock import patch
 
 import pytest
 import torch
+from gaitgauge.policy.loading import load_policy
 from gaitgauge.robots.anatomy.body_plan import base_mass
 from gaitgauge.robots.registry import load_robot
+from gaitgauge.studies.trials.running import run_each
 from gaitgauge.studies.trials.scenario import (
     Force,
     Ground,
@@ -21,6 +23,7 @@ from gaitgauge.studies.trials.scenario import (
 from gaitgauge.terrains.course import Stretch
 from gaitgauge.training.configuration import ConfigurationError
 from gaitgauge.training.environment.configuration import EnvironmentConfiguration, RandomizationConfiguration
+from gaitgauge.training.environment.environment import TrainingEnvironment
 from gaitgauge.training.environment.scenarios import read_scenarios
 from gaitgauge.training.tasks import find_task
 from small_environment import FALLS_END, FLAT, NO_PUSH, STILL, gliding, idle, make
@@ -195,3 +198,34 @@ def test_what_is_left_out_is_said(files, caplog):
     path.write_text(scenario_text(replace(PLAIN, name="fast", success=Success(beyond=0.15))))
     read_scenarios(EnvironmentConfiguration(scenarios=(str(path),)))
     assert "scenario 'fast' says what success or a fall is" in caplog.text
+
+
+@pytest.mark.slow
+def test_what_falls_in_a_trial_falls_in_training(tmp_path):
+    """The shipped policy in MuJoCo, by the gauge's trial and in training worlds: felled by a push, and not by a walk."""
+    policy = load_policy("pretrained")
+    hard = Force(direction="left", newtons=(300.0, 300.0), begin=(0.5, 0.5), seconds=(0.3, 0.3))
+    walk = (Leg(seconds=0.5, velocity=(0.0, 0.0, 0.0)), Leg(seconds=1.5, velocity=(0.5, 0.0, 0.0)))
+    shoved = replace(PLAIN, name="shoved", commands=walk, forces=(hard,))
+    walking = replace(PLAIN, name="walking", commands=walk)
+    for scenario in (shoved, walking):
+        (tmp_path / f"{scenario.name}.toml").write_text(scenario_text(scenario))
+    robot = load_robot("go2")
+    trials = run_each(policy, robot, [(scenario, seed) for scenario in (shoved, walking) for seed in range(3)])
+    assert [trial.outcome for trial in trials] == ["fell"] * 3 + ["success"] * 3
+    settings = [f"environment.scenarios={tmp_path}", "environment.scenario_share=0.75", "environment.num_envs=8"]
+    settings += ["environment.terrain.levels=1", "environment.terrain.variants=1"]
+    settings += ["environment.terrain.highest_start_level=0", "environment.scenario_variation=0.05"]
+    task = find_task("go2-moe-cts", settings)
+    environment = TrainingEnvironment(task.environment, backend="mujoco", device="cpu", fuse=False)
+    session, observations = policy.session(8, device="cpu"), environment.get_observations()
+    fell, over = torch.zeros(8, dtype=torch.bool), torch.zeros(8, dtype=torch.bool)
+    with torch.inference_mode():
+        for _ in range(100):
+            observations, _, done, extras = environment.step(session.act(observations["policy"]))
+            ended = done.bool()
+            fell |= ended & ~over & (extras["time_outs"] == 0.0)
+            over |= ended
+            session.reset(ended)
+    environment.close()
+    assert fell[2:].tolist() == [True] * 3 + [False] * 3 and bool(over[2:].all())
