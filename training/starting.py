@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import signal
 import sys
 import tempfile
 import uuid
@@ -69,6 +70,12 @@ def start_processes(count: int, arguments: Sequence[str]) -> int:
             tellers = [rank] if rank else range(1, count) if killed else []
             texts = [p.read_text(errors="replace") for r in tellers for p in Path(folder).rglob(f"{r}/stderr.log")]
             sys.stderr.write("".join(dict.fromkeys(texts)))
+            if killed:
+                name = signal.Signals(-failure.exitcode).name
+                sys.stderr.write(
+                    f"process {rank} of {count}, from 0, was killed ({name}); if no checkpoint is named above, no iteration was "
+                    "complete\n"
+                )
             return 128 - failure.exitcode if killed else failure.exitcode
         except SignalException as error:
             return 128 + error.sigval

@@ -19,7 +19,7 @@ from gaitgauge.training.environment.configuration import (
     RewardConfiguration,
     TerminationConfiguration,
 )
-from gaitgauge.training.environment.domain_randomization import MotorParameters
+from gaitgauge.training.environment.domain_randomization import MotorParameters, draw_bodies
 from gaitgauge.training.environment.environment import TrainingEnvironment
 from gaitgauge_fake_engine import FakeBackend, FakeScript
 from small_environment import FLAT, STAIRS, gliding, idle, make
@@ -269,6 +269,17 @@ def test_randomization_ranges():
         assert low - 1e-6 <= values.min() < low + 0.05 * (high - low)
         assert high - 0.05 * (high - low) < values.max() <= high + 1e-6
         assert float(values.mean()) == pytest.approx((low + high) / 2, abs=0.03 * (high - low))
+
+
+def test_torsion_of_the_feet_is_at_its_ends_in_a_share_of_the_worlds():
+    ranges = RandomizationConfiguration(foot_torsion=(0.5, 1.5), foot_torsion_ends=0.4)
+    torsion = draw_bodies(ranges, 4000, 3, torch.Generator().manual_seed(0))["foot_torsion"]
+    shares = [float((torsion == end).float().mean()) for end in (0.5, 1.5)]
+    assert shares == pytest.approx([0.4, 0.4], abs=0.03)
+    between = torsion[(torsion > 0.5) & (torsion < 1.5)]
+    assert float(between.mean()) == pytest.approx(1.0, abs=0.05) and float(between.std()) == pytest.approx(
+        12**-0.5, abs=0.03
+    )
 
 
 def test_motors_that_nobody_varies_are_not_written(monkeypatch):

@@ -128,6 +128,11 @@ CASES = {
         math.exp(-1.0),
         1.0,
     ),
+    "turn_error": (
+        {"command": one_world([0.0, 0.05, -1.0], 3), "base_angular_velocity_b": one_world([9.0, 9.0, -0.4], 3)},
+        0.6,
+        0.0,
+    ),
     "progress": (
         {"command": one_world([0.6, -0.8, 9.0], 3), "base_linear_velocity_b": one_world([0.5, 0.0, 9.0], 3)},
         0.3,
@@ -252,6 +257,21 @@ def test_weights_follow_progress(quiet):
     assert found == pytest.approx([-2.0, -2.0, -1.0, 0.0, 0.0])
 
 
+@pytest.mark.parametrize(
+    ("command", "rate", "expected"),
+    [
+        ([0.0, 0.0, 1.0], 0.4, 0.6),
+        ([0.0, 0.0, 1.0], 1.6, 0.6),
+        ([0.0, 0.05, -2.0], 0.0, 1.0),
+        ([0.0, 0.0, 0.1], 0.5, 0.0),
+        ([0.5, 0.0, 1.0], 0.4, 0.0),
+    ],
+)
+def test_the_error_of_turns_on_the_spot_counts_alike_below_and_above(quiet, command, rate, expected):
+    turning = replace(quiet, command=one_world(command, 3), base_angular_velocity_b=one_world([0.0, 0.0, rate], 3))
+    assert float(REWARD_TERMS["turn_error"](turning)[0]) == pytest.approx(expected)
+
+
 def test_a_tile_pays_by_its_factors(quiet):
     kinds = [FLAT_TILE, replace(FLAT_TILE, progress=0.0, yaw_tracking=1.5, linear_tracking=0.5)]
     settings = RewardConfiguration(progress=2.0, yaw_tracking=1.0, linear_tracking=1.0)
@@ -268,7 +288,7 @@ def test_a_tile_pays_by_its_factors(quiet):
 def test_every_weight_names_a_term():
     assert {f.name for f in fields(RewardWeights)} - {"own"} == set(REWARD_TERMS)
     parts = [{f.name for f in fields(part)} for part in (RewardWeights, RewardShapes, RewardLimits)]
-    assert {f.name for f in fields(RewardConfiguration)} == set.union(*parts) and sum(map(len, parts)) == 49
+    assert {f.name for f in fields(RewardConfiguration)} == set.union(*parts) and sum(map(len, parts)) == 50
 
 
 @pytest.mark.parametrize(

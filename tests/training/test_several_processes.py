@@ -129,6 +129,7 @@ def test_a_run_that_loses_a_process_ends_with_a_checkpoint_and_a_sentence(tmp_pa
     assert description["outcome"] == "lost a process" and description["iteration"] > 0
     (sentence,) = [line for line in output.splitlines() if line.startswith("gaitgauge: ")]
     assert "another process has gone: " in sentence
+    assert f"process {lost} of 2, from 0, was killed (SIGKILL)" in output
     here = last.relative_to(tmp_path)
     assert f"iteration {description['iteration']} is in '{here}', go on with --resume {here.parent}" in sentence
     resumed = start(tmp_path, *TRAIN, "--resume", "latest", "--iterations", str(description["iteration"] + 1))

@@ -249,6 +249,8 @@ class RandomizationConfiguration:
     """Effective sliding friction, once per world. Published: 0.5 to 1.5; the gauge judges 0.2 to 1.0."""
     foot_torsion: tuple[NotNegative, NotNegative] = (1.0, 1.0)
     """Factor on the feet's torsional and rolling friction, once per world; acts with physics.foot_condim 4 or 6."""
+    foot_torsion_ends: Annotated[float, Field(ge=0.0, lt=0.5)] = 0.0
+    """Share of the worlds at each end of foot_torsion; the rest are between."""
     foot_softness: tuple[Positive, Positive] = (1.0, 1.0)
     """Factor on the time constant of the feet's contacts, once per world."""
     base_mass: tuple[_Kilograms, _Kilograms] = (-1.0, 1.0)
@@ -271,7 +273,7 @@ class RandomizationConfiguration:
     """Time for which the previous target still acts [s], in whole substeps, every control step."""
 
     def __post_init__(self) -> None:
-        check_rising(self, *(f.name for f in fields(self)))
+        check_rising(self, *(f.name for f in fields(self) if f.name != "foot_torsion_ends"))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -62,7 +62,12 @@ def draw_bodies(
         "base_com_offset": between(ranges.base_com, 3),
     }
     feet = {"foot_torsion": ranges.foot_torsion, "foot_softness": ranges.foot_softness}
-    return drawn | {name: between(bounds) for name, bounds in feet.items() if bounds != (1.0, 1.0)}
+    drawn |= {name: between(bounds) for name, bounds in feet.items() if bounds != (1.0, 1.0)}
+    if ranges.foot_torsion_ends and "foot_torsion" in drawn:
+        low, high = ranges.foot_torsion
+        stretched = (drawn["foot_torsion"] - 0.5 * (low + high)) / (1.0 - 2.0 * ranges.foot_torsion_ends)
+        drawn["foot_torsion"] = (stretched + 0.5 * (low + high)).clamp(low, high)
+    return drawn
 
 
 class MotorParameters:

@@ -74,6 +74,9 @@ class RewardWeights:
     """Tracking of the commanded horizontal velocity."""
     yaw_tracking: float = 0.5
     """Tracking of the commanded yaw rate."""
+    turn_error: float = 0.0
+    """Absolute error of the yaw rate in turns on the spot, at most 1 rad/s. Unlike the tracking kernel it has the same slope far below and
+    above the commanded rate."""
     progress: float = 0.0
     """Velocity along the command as a share of it. Unlike the tracking kernels it has a slope where the robot stands before an obstacle."""
     vertical_velocity: Ramp = _VERTICAL_VELOCITY

@@ -21,6 +21,8 @@ from .terrain_configuration import TileConfiguration
 
 SLOWEST_COMMAND = 0.1
 """Commanded speed below which nothing is asked of a robot's progress [m/s]."""
+SLOWEST_TURN, LARGEST_TURN_ERROR = 0.2, 1.0
+"""Commanded yaw rate from which a turn on the spot is judged, and the error from which its penalty grows no more [rad/s]."""
 
 
 def linear_tracking(inputs: StepInputs) -> torch.Tensor:
@@ -33,6 +35,14 @@ def yaw_tracking(inputs: StepInputs) -> torch.Tensor:
     """exp(−Δωz²/σw)."""
     error = inputs.command[:, 2] - inputs.base_angular_velocity_b[:, 2]
     return torch.exp(-error.square() / inputs.sigma[:, 2])
+
+
+def turn_error(inputs: StepInputs) -> torch.Tensor:
+    """Absolute error of the yaw rate [rad/s], at most ``LARGEST_TURN_ERROR``; 0 but for turns on the spot of ``SLOWEST_TURN`` or more."""
+    yaw = inputs.command[:, 2]
+    turns = ~commanded_to_move(inputs.command) & (yaw.abs() >= SLOWEST_TURN)
+    error = (yaw - inputs.base_angular_velocity_b[:, 2]).abs().clamp(max=LARGEST_TURN_ERROR)
+    return torch.where(turns, error, 0.0)
 
 
 def progress(inputs: StepInputs) -> torch.Tensor:
@@ -171,6 +181,7 @@ REWARD_TERMS: Mapping[str, RewardTerm] = {
     for f in (
         linear_tracking,
         yaw_tracking,
+        turn_error,
         progress,
         vertical_velocity,
         roll_pitch_rate,

@@ -109,7 +109,7 @@ _PRECISE_GROUND = replace(
 """Level ground beside ground that is to be climbed: reversals, standing and turns on the spot are learned here."""
 _PRECISE = Stretch(
     name="precise",
-    begin=0.8,
+    begin=0.7,
     settings=" ".join(
         (
             # Feet resist turning on the ground, as the gauge's do, in some worlds and turn freely in others.
@@ -118,9 +118,13 @@ _PRECISE = Stretch(
             "environment.physics.impratio=10",
             "environment.physics.iterations=10",
             "environment.randomization.foot_torsion=0,1",
-            # The tracking kernels are narrow, and a turn at another rate than commanded costs more.
+            "environment.randomization.foot_torsion_ends=0.4",
+            # The tracking kernels are narrow, and turns on the spot at another rate than commanded cost more.
             "environment.rewards.tracking_sigma=0.15",
             "environment.rewards.yaw_tracking=1.5",
+            "environment.rewards.turn_error=-2",
+            "environment.terrain.tiles.flat.stationary_probability=3",
+            "environment.terrain.tiles.flat.stationary_yaw_probability=3",
             # The grounds on which most is left to gain.
             "environment.terrain.tiles.wave.share=0.18",
             "environment.terrain.tiles.flat.share=0.14",
