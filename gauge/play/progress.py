@@ -33,7 +33,7 @@ _AGAIN = 1.2
 """Length of a quality episode over the usual one where a penetration begins a goal again."""
 _SETTLING = 0.1
 """Share of the time up to its limit that the longest segment of an episode takes on beyond the usual length."""
-_SLOWEST = 0.45
+_SLOWEST = 0.6
 """The same for the slowest of many episodes that are played side by side, beyond that of one."""
 _UNEVEN = 1.1
 """Time of a search over that of its tests played without a wait."""
