@@ -1,4 +1,4 @@
-"""Identifies simulated robots with known constants and counts how often they lie inside their 95 % intervals.
+"""Identifies simulated robots with known constants and counts how often they lie inside their 98 % intervals.
 
     python benchmarks/identification_coverage.py --draws 100 --processes 32
 

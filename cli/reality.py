@@ -112,7 +112,7 @@ def print_identified(console: Terminal, results: Mapping[str, Any]) -> None:
         "constant",
         "nominal",
         "identified",
-        "95 % interval",
+        "98 % interval",
         "",
         numbers=True,
     )

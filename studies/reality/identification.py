@@ -25,6 +25,8 @@ _KNOWN = 0.5
 """Largest ratio of an unknown's standard deviation after and before the logs at which they count as having told it."""
 _TORQUE_WEIGHT = 0.5
 """Weight of a torque's squared difference beside a position's, each in units of the nominal set's RMS."""
+_LEVEL = 0.98
+"""Probability with which an interval is to hold its constant."""
 _ITERATIONS = 12
 _STEP = 0.02
 """Perturbation for derivatives, in standard deviations of the prior."""
@@ -47,9 +49,9 @@ class Kind:
 
 KINDS: dict[str, Kind] = {
     "armature": Kind(spread=0.02, low=1e-5, high=1.0, unit="kg·m²"),
-    "joint_damping": Kind(spread=0.3, low=0.0, high=20.0, unit="N·m·s/rad"),
-    "friction_loss": Kind(spread=0.5, low=0.0, high=20.0, unit="N·m"),
-    "stiffness_factor": Kind(spread=0.1, low=0.3, high=2.0),
+    "joint_damping": Kind(spread=0.3, low=0.0, high=20.0, each_joint=True, unit="N·m·s/rad"),
+    "friction_loss": Kind(spread=0.5, low=0.0, high=20.0, each_joint=True, unit="N·m"),
+    "stiffness_factor": Kind(spread=0.1, low=0.3, high=2.0, each_joint=True),
     "damping_factor": Kind(spread=0.1, low=0.3, high=2.0, each_joint=True),
     "target_offset": Kind(spread=0.05, low=-0.5, high=0.5, each_joint=True, unit="rad"),
 }
@@ -85,7 +87,7 @@ class Fit:
     values: Array
     """Of the unknowns, (U,)."""
     intervals: Array
-    """95 % intervals, (U, 2)."""
+    """98 % intervals, (U, 2): of sixty at 95 %, three would not hold their constant."""
     known: NDArray[np.bool_]
     """False where the logs do not tell an unknown, which then is at its prior, (U,)."""
     evaluations: int
@@ -321,11 +323,13 @@ def _identify(problem: _Problem, draws: int, seed: int, say: Say) -> Fit:
             known[free[~told]] = False
     drawn = _bootstrap(problem, x, free, residual, jacobian, trust, draws, seed)
     spread = drawn.std(axis=0)
+    from scipy.stats import norm as normal
     from scipy.stats import t as student
 
     blocks = int(problem.block.max()) + 1
-    reach = float(student.ppf(0.975, max(blocks - 1, 1)))
-    intervals = np.stack([priors - 1.96 * spreads, priors + 1.96 * spreads], axis=1)
+    tail = (1.0 + _LEVEL) / 2.0
+    reach, widest = float(student.ppf(tail, max(blocks - 1, 1))), float(normal.ppf(tail)) * spreads
+    intervals = np.stack([priors - widest, priors + widest], axis=1)
     intervals[free] = np.stack([x[free] - reach * spread, x[free] + reach * spread], axis=1)
     intervals = intervals.clip(*(bound[:, None] for bound in problem.bounds()))
     delays = tuple(float(v) for u, v in zip(problem.unknowns, x, strict=True) if u.key == "delay")

@@ -159,5 +159,7 @@ def _notes(logs: Sequence[Log], found: Fit) -> list[str]:
         notes.append(f"at the end of their range: {', '.join(bounds)}")
     if max(found.delays) - min(found.delays) > 0.001:
         low, high = 1e3 * min(found.delays), 1e3 * max(found.delays)
-        notes.append(f"the delay differs between logs, {low:.1f} to {high:.1f} ms; the set has their mean")
+        notes.append(
+            f"the delay differs between logs, {low:.1f} to {high:.1f} ms, which a log with a wrong kd causes too; the set has their mean"
+        )
     return notes

@@ -56,7 +56,7 @@ def test_what_a_log_does_not_tell_stays_at_its_prior(log):
     still = replace(still, position=rest + noise, fresh=np.ones(len(rest), dtype=bool))
     found = identify([still], NOMINAL, draws=20, threads=1)
     told = {u.label: bool(known) for u, known in zip(found.unknowns, found.known, strict=True)}
-    assert not told["armature calf"] and not told["stiffness_factor hip"]
+    assert not told["armature calf"] and not told["stiffness_factor FL_hip"]
     assert found.parameters.armature == NOMINAL.armature
     assert all(
         u.kind.low <= low < high <= u.kind.high for u, (low, high) in zip(found.unknowns, found.intervals, strict=True)
