@@ -107,7 +107,6 @@ class _Problem:
         self.rows = [_chosen(log) for log in logs]
         self.steps = [num_steps(log) for log in logs]
         self.starts = [beginning(log) for log in logs]
-        self.fixed: dict[int, float] = {}
         self.evaluations = 0
         self.groups = np.zeros(joints, dtype=np.int64)
         for number, members in enumerate(joint_groups(self.robot).values()):
@@ -175,7 +174,11 @@ class _Problem:
         log, sets, targets, starts = self.logs[number], [], [], []
         held: dict[float, Array] = {}
         position, velocity = self.starts[number]
-        for x in guesses:
+        own = [
+            i for i, u in enumerate(self.unknowns) if u.log in (None, number)
+        ]  # guesses may differ in other logs alone
+        _, first, same = np.unique(guesses[:, own], axis=0, return_index=True, return_inverse=True)
+        for x in guesses[first]:
             found = self.constants(x, number)
             values: dict[str, Any] = {key: tuple(found[key].tolist()) for key in KINDS}
             sets.append(acting_parameters(log, self.base if nominal else replace(self.base, **values)))
@@ -187,8 +190,8 @@ class _Problem:
             )
             targets.append(held[delay] + offset)
             starts.append((position, velocity + found["start"]))
-        self.evaluations += len(guesses)
-        return self.rig.run(sets, np.stack(targets), starts)
+        self.evaluations += len(first)
+        return self.rig.run(sets, np.stack(targets), starts)[:, same.ravel()]
 
     def series(self, guesses: Array, *, nominal: bool = False) -> Array:
         """Return the residuals of some guesses in their units, without those of the prior, (G, R)."""
@@ -323,12 +326,11 @@ def _identify(problem: _Problem, draws: int, seed: int, say: Say) -> Fit:
             known[free[~told]] = False
     drawn = _bootstrap(problem, x, free, residual, jacobian, trust, draws, seed)
     spread = drawn.std(axis=0)
-    from scipy.stats import norm as normal
-    from scipy.stats import t as student
+    from scipy import stats
 
     blocks = int(problem.block.max()) + 1
     tail = (1.0 + _LEVEL) / 2.0
-    reach, widest = float(student.ppf(tail, max(blocks - 1, 1))), float(normal.ppf(tail)) * spreads
+    reach, widest = float(stats.t.ppf(tail, max(blocks - 1, 1))), float(stats.norm.ppf(tail)) * spreads
     intervals = np.stack([priors - widest, priors + widest], axis=1)
     intervals[free] = np.stack([x[free] - reach * spread, x[free] + reach * spread], axis=1)
     intervals = intervals.clip(*(bound[:, None] for bound in problem.bounds()))
