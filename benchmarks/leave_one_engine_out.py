@@ -39,8 +39,8 @@ GROUPS = {
 }
 TARGETS = ("score", "survival", "tracking")
 RESAMPLES = 10_000
-SHIPPED = {"shipped-first": "2fd2ad75", "shipped-middle": "2c6f239b"}
-"""Earlier files of the shipped training, by commit."""
+SHIPPED = {"shipped-first": "2fd2ad75", "shipped-middle": "2c6f239b", "pretrained": "50f33aa7"}
+"""Files of the shipped training, by commit; another policy ships as ``pretrained`` since the study."""
 PUBLIC = {
     "katari16-dc": "katari16_policy_dc_cfg_comparasion/policy_dc_cfg_comparasion.pt",
     "katari16-pace-cfg": "katari16_policy_pace_cfg_comparasion/policy_pace_cfg_comparasion.pt",
@@ -69,7 +69,6 @@ def gather(folder: Path, public: Path) -> None:
     for pattern in ("baselines-*", "from-nothing-*", "more-level-ground-*"):
         for entry in listed(pattern):
             fetch(entry, folder)
-    shutil.copy(ROOT / "policy" / "pretrained" / "go2.gauge.pt", folder / "pretrained.gauge.pt")
     for name, commit in SHIPPED.items():
         path = f"{commit}:policy/pretrained/go2.gauge.pt"
         shown = subprocess.run(["git", "-C", str(ROOT), "show", path], capture_output=True, check=True)
