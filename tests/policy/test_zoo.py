@@ -9,6 +9,7 @@ import pytest
 import torch
 from gaitgauge.cli.inspect import show_contract
 from gaitgauge.cli.requests import ShowRequest
+from gaitgauge.gauge.suite import load_suite
 from gaitgauge.policy import loading
 from gaitgauge.policy.base import PolicyError
 from gaitgauge.policy.contract import standard_contract
@@ -161,3 +162,11 @@ def test_wrong_presets_in_a_description_are_one_sentence(tmp_path, text, message
     with pytest.raises(PolicyError, match=message) as caught:
         described_contract(file, GO2)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["suite", "gentle", "biped", "biped-gentle"])
+def test_the_board_of_public_policies_judges_each_robot_in_its_own_measure(name):
+    """An 83 kg robot that walks without a fall scored 0.01 on a Go2's watts and newton metres."""
+    suite = load_suite(str(Path(__file__).parents[2] / "benchmarks" / "public_contracts" / f"{name}.toml"))
+    assert suite.metrics.measure == "robot" and "motion_done" in suite.metrics.weights
+    assert suite.matrix.terrains == ("flat",) and suite.commands.beyond == ("clip" if name == "suite" else "scale")
