@@ -53,26 +53,50 @@ class Ranges:
     """Linear speed that is allowed in both directions [m/s], (N, 2)."""
     reach: torch.Tensor
     """Way of a control step at 80 % of the highest speed [m], (N,)."""
+    interval: torch.Tensor
+    """Time between two draws [s], (N,); as the rest, the tile's own."""
+    interval_steps: torch.Tensor
+    """The same in control steps, (N,) float32."""
+    stationary: torch.Tensor
+    """Factor on the share of stationary commands, (N,)."""
+    reversal: torch.Tensor
+    """Chance of a reversal, (N,)."""
+    shares: torch.Tensor
+    """Shares of extreme and of straight draws, of flips, and of stationary commands that turn on the spot, (N, 4)."""
 
 
-_RANGE_WIDTHS = (3, 3, 2, 2, 1)
+_RANGE_WIDTHS = (3, 3, 2, 2, 1, 1, 1, 1, 1, 4)
 """Columns of ``Ranges``, in order."""
 _MOVES = 0.01
 """Square of the commanded speed from which there is something to reverse [m²/s² and rad²/s²]."""
 
 
 def _range_table(
-    configuration: CommandConfiguration, terrain_limits: Sequence[tuple[float, float, float]], period: float
+    configuration: CommandConfiguration, tiles: Sequence[TileConfiguration], period: float
 ) -> torch.Tensor:
     """Return ``Ranges`` of every stage and kind of terrain, (stages, kinds, columns): looked up, not computed, in every step."""
     stages = [(s.forward, s.lateral, s.yaw) for s in configuration.drawn_stages]
     bounds = torch.tensor(stages, dtype=torch.float32)[:, None]
-    limit = torch.tensor(terrain_limits, dtype=torch.float32)
+    limit = torch.tensor([tile.command_limits for tile in tiles], dtype=torch.float32)
     low, high = torch.maximum(bounds[..., 0], -limit), torch.minimum(bounds[..., 1], limit)
     downward = -low[..., :2]
     either = torch.minimum(downward, high[..., :2]).clamp_min(0.0)
     fastest = torch.maximum(downward, high[..., :2]).amax(dim=-1, keepdim=True).clamp_min(1e-3)
-    return torch.cat((low, high, downward, either, 0.8 * period * fastest), dim=-1)
+    own = [
+        (
+            interval := tile.interval or configuration.interval,
+            max(round(interval / period), 1),
+            tile.stationary_probability,
+            tile.reversal_probability,
+            configuration.extreme_probability,
+            configuration.straight_probability,
+            configuration.flip_probability,
+            configuration.stationary_yaw_probability * tile.stationary_yaw_probability,
+        )
+        for tile in tiles
+    ]
+    rest = torch.tensor(own, dtype=torch.float32).expand(len(stages), -1, -1)
+    return torch.cat((low, high, downward, either, 0.8 * period * fastest, rest), dim=-1)
 
 
 def largest_commands(
@@ -116,36 +140,34 @@ class CommandGenerator:
         self._configuration = configuration
         begins = [stage.begin for stage in configuration.drawn_stages]
         self._begins = torch.tensor(begins, dtype=torch.float32, device=device)
-        limits = [tile.command_limits for tile in tiles]
-        self._table = _range_table(configuration, limits, control_period).to(device)
+        self._table = _range_table(configuration, tiles, control_period).to(device)
         self._ends = torch.tensor([tile.ends for tile in tiles], device=device)
-        shares = (
-            configuration.extreme_probability,
-            configuration.straight_probability,
-            configuration.flip_probability,
-        )
-        self._shares = torch.tensor(shares, device=device)
         self._stationary = RampTable([configuration.stationary_probability], device)
-        self._stationary_factor = torch.tensor([tile.stationary_probability for tile in tiles], device=device)
-        turning = [configuration.stationary_yaw_probability * tile.stationary_yaw_probability for tile in tiles]
-        self._turning = torch.tensor(turning, device=device)
-        self._reversal = torch.tensor([tile.reversal_probability for tile in tiles], device=device)
         self._reverses = any(tile.reversal_probability > 0 for tile in tiles)
         # A number below the first bound sets an axis to zero, else one below the second bound to its lower limit.
         self._zero_below = torch.tensor(configuration.extreme_zero_probability, device=device)
         self._low_below = 0.5 * (1.0 + self._zero_below)
         self._period, self._length = control_period, max_episode_length
         self._stationary_steps = round(configuration.stationary_longest / control_period)
-        intervals = [tile.interval or configuration.interval for tile in tiles]
-        self._interval = torch.tensor(intervals, device=device)
-        self._interval_steps = (self._interval / control_period).round().long().clamp_min(1)
 
     def ranges(self, kind: torch.Tensor, progress: torch.Tensor) -> Ranges:
         """Return the range that the present stage allows each world."""
         stage = (progress >= self._begins).sum() - 1
         rows = self._table.index_select(0, stage.reshape(1)).squeeze(0)[kind]
-        low, high, downward, either, reach = rows.split(_RANGE_WIDTHS, dim=1)
-        return Ranges(low=low, high=high, downward=downward, either=either, reach=reach.squeeze(1))
+        low, high, downward, either, *others, shares = rows.split(_RANGE_WIDTHS, dim=1)
+        reach, interval, interval_steps, stationary, reversal = (column.squeeze(1) for column in others)
+        return Ranges(
+            low=low,
+            high=high,
+            downward=downward,
+            either=either,
+            reach=reach,
+            interval=interval,
+            interval_steps=interval_steps,
+            stationary=stationary,
+            reversal=reversal,
+            shares=shares,
+        )
 
     def draw(
         self,
@@ -172,12 +194,10 @@ class CommandGenerator:
         settings, ranges = self._configuration, self.ranges(kind, progress)
         low, high = ranges.low, ranges.high
         remaining = (self._length - episode_length).clamp_min(1)
-        interval_steps = self._interval_steps[kind]
-        way = (settings.required_distance - issued.norm(dim=1) * self._interval[kind]).clamp_min(0.0)
+        way = (settings.required_distance - issued.norm(dim=1) * ranges.interval).clamp_min(0.0)
         linear, yaw = self._uniform(uniform, ranges, way, remaining)
         kind_number = uniform["command_kind"]
-        extreme_drawn, straight, flipped = (kind_number[:, :3] < self._shares).unbind(1)
-        turning = kind_number[:, 3] < self._turning[kind]
+        extreme_drawn, straight, flipped, turning = (kind_number < ranges.shares).unbind(1)
 
         # Extreme: every axis at a limit or zero. Opposite: what the gauge does halfway through each of its diagonal commands.
         corner = uniform["command_corner"]
@@ -191,17 +211,17 @@ class CommandGenerator:
         is_extreme = extreme_drawn | is_opposite
 
         # Stationary: as long as the rest of the episode still allows the required way at 80 % of the highest speed.
-        spare = remaining - (way / ranges.reach).ceil().long()
+        spare = remaining - (way / ranges.reach).ceil()
         stationary_steps = spare.clamp(max=self._stationary_steps)
-        stationary_probability = self._stationary.at(progress)[0] * self._stationary_factor[kind]
+        stationary_below = torch.addcmul(ranges.shares[:, 0], self._stationary.at(progress)[0], ranges.stationary)
         is_stationary = ~is_extreme & (stationary_steps > 0)
-        is_stationary &= kind_number[:, 0] < settings.extreme_probability + stationary_probability
+        is_stationary &= kind_number[:, 0] < stationary_below
 
         linear = linear.masked_fill(is_stationary[:, None], 0.0)
         yaw = yaw.masked_fill(torch.where(is_stationary, ~turning, straight)[:, None], 0.0)
         drawn = torch.where(is_extreme[:, None], extremes, torch.cat((linear, yaw), dim=1))
         drawn = torch.where(is_opposite[:, None], opposite, drawn)
-        steps = torch.where(is_stationary, stationary_steps, interval_steps)
+        steps = torch.where(is_stationary, stationary_steps, ranges.interval_steps).long()
         holds_heading = straight & ~is_stationary & ~is_extreme
 
         # Crossing: straight on or back for the whole episode, on ground that has an edge to come to.
@@ -219,12 +239,13 @@ class CommandGenerator:
         # Reversal: back at once. Crossings are drawn at the start of an episode alone, so their numbers are free later.
         if self._reverses:
             chance, straight_back, _ = uniform["command_crossing"].unbind(1)
-            moves = command.square().sum(dim=1) > _MOVES
-            reverses = (episode_length > 0) & (chance < self._reversal[kind]) & moves
-            back = (straight_back < 0.5) & (command[:, :2].square().sum(dim=1) > _MOVES)
+            squares = command.square()
+            moves, walks = squares.sum(dim=1) > _MOVES, squares[:, :2].sum(dim=1) > _MOVES
+            reverses = (episode_length > 0) & (chance < ranges.reversal) & moves
+            back = (straight_back < 0.5) & walks
             reversed_ = torch.cat((opposite[:, :2], opposite[:, 2:].masked_fill(back[:, None], 0.0)), dim=1)
             drawn = torch.where(reverses[:, None], reversed_, drawn)
-            steps = torch.where(reverses, interval_steps, steps)
+            steps = torch.where(reverses, ranges.interval_steps.long(), steps)
             is_extreme = torch.where(reverses, extreme, is_extreme)
             holds_heading = torch.where(reverses, back, holds_heading)
         return CommandDraw(command=drawn, steps=steps, extreme=is_extreme, holds_heading=holds_heading)
