@@ -30,8 +30,7 @@ gc.disable()  # until all is imported: most of it stays
 
 
 def pytest_collection_finish() -> None:
-    """Leave what the packages made when they were imported out of every later search for garbage."""
-    gc.collect()
+    """Leave what was imported out of every search for garbage, without a first search, which would take a second."""
     gc.freeze()
     gc.enable()
     gc.set_threshold(50_000, 20, 20)  # tests leave little behind, and the searches took a fiftieth of the time
@@ -179,6 +178,49 @@ def robots_are_tried_here() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         for module in (checking, drafting, examining):
             patch.setattr(module, "run_apart", run_here)
+        yield
+
+
+@pytest.fixture(scope="module")
+def programs_run_here() -> Iterator[None]:
+    """Programs of a test's own need no process of their own, which takes longer than they do: ``test_fence_process.py`` needs it."""
+    from gaitgauge.policy.base import PolicyError
+    from gaitgauge.policy.foreign.fence import child
+
+    class Here(child.Child):
+        def __init__(self, make: Callable[[bytes, str], child.Program], data: bytes, *, source: str) -> None:
+            self._source, self._dropped, self._sessions, self._program = source, [], {}, None
+            self._memory = child._shared_memory()[0]
+            self._program = self._guarded(lambda: make(data, source))
+
+        def _guarded(self, work: Callable[[], Any]) -> Any:
+            enabled = torch._C._get_mkldnn_enabled()
+            torch._C._set_mkldnn_enabled(False)  # as in that process
+            try:
+                with torch.inference_mode():
+                    return work()
+            except Exception as error:
+                raise PolicyError(child._reason(error, self._source).decode()) from error
+            finally:
+                torch._C._set_mkldnn_enabled(enabled)
+
+        def _exchange(self, message: bytes) -> bytes:
+            request = json.loads(message)
+            answer = self._guarded(lambda: child._answer(self._program, self._sessions, self._memory, request))
+            return json.dumps(answer).encode()
+
+        def act(
+            self, session: child.ChildSession, observation: torch.Tensor, forget: torch.Tensor | None
+        ) -> torch.Tensor:
+            played, numbers = self._sessions[session.number]
+            numbers.observation.copy_(observation)
+            if forget is not None:
+                self._guarded(lambda: played.reset(forget))
+            numbers.action.copy_(self._guarded(lambda: played.act(numbers.observation.clone())))
+            return numbers.action.clone()
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(child, "Child", Here)
         yield
 
 

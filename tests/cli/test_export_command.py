@@ -6,6 +6,8 @@ from pathlib import Path
 import pytest
 from gaitgauge.policy.loading import load_policy
 
+pytestmark = pytest.mark.usefixtures("programs_run_here")
+
 
 def test_all_formats(run, policy, tmp_path):
     result = run("export", policy, "--out", tmp_path / "out")

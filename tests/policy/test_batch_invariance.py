@@ -12,6 +12,8 @@ from gaitgauge.policy.native import NativePolicy, StoredNetwork, save_policy
 from gaitgauge.policy.networks.architectures import ARCHITECTURES, MlpNetwork
 from gaitgauge.robots import load_robot
 
+pytestmark = pytest.mark.usefixtures("programs_run_here")
+
 ROBOT = load_robot("go2")
 
 

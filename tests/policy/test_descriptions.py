@@ -50,6 +50,8 @@ from onnx import helper
 from scipy.spatial.transform import Rotation
 from torch import nn
 
+pytestmark = pytest.mark.usefixtures("programs_run_here")
+
 
 def test_a_deploy_file_beside_a_script(tmp_path):
     """With the tag that unitree_rl_lab's exporter leaves in it."""

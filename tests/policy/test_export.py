@@ -30,6 +30,8 @@ from gaitgauge.policy.native import NativePolicy, StoredNetwork
 from gaitgauge.policy.networks.architectures import ARCHITECTURES
 from gaitgauge.robots import load_robot
 
+pytestmark = pytest.mark.usefixtures("programs_run_here")
+
 torch.set_num_threads(1)
 
 SMALL = {"actor_hidden": [32], "latent_width": 8}

@@ -20,6 +20,8 @@ from gaitgauge.policy.native import NativePolicy
 from gaitgauge.robots import load_robot
 from gaitgauge.terrains.registry import make_terrain
 
+pytestmark = pytest.mark.usefixtures("programs_run_here")
+
 STEPS = 50
 RUNTIME = "onnxruntime==1.16.0"
 RUN = """

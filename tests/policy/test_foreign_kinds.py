@@ -34,6 +34,8 @@ from gaitgauge.policy.observation import ObservationBuilder
 from onnx import TensorProto, helper, numpy_helper
 from torch import nn
 
+pytestmark = pytest.mark.usefixtures("programs_run_here")
+
 
 def test_a_number_stands_for_all_joints_and_entries(tmp_path):
     module = network(45)

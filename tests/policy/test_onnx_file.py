@@ -18,6 +18,8 @@ from gaitgauge.policy.native import first_line
 from onnx import TensorProto, helper, numpy_helper
 from torch import nn
 
+pytestmark = pytest.mark.usefixtures("programs_run_here")
+
 EPISODES = 5
 TERM_WIDTHS = (3, 3, 3, 12, 12, 12)
 

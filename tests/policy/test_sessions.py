@@ -13,6 +13,8 @@ from gaitgauge.policy.networks.architectures import ARCHITECTURES, unit
 from torch import nn
 from torch.nn import functional
 
+pytestmark = pytest.mark.usefixtures("programs_run_here")
+
 EPISODES, STEPS, RESETS = 24, 12, {0: None, 5: [2, 7], 6: [2], 9: [0, 23]}
 ACTIVATIONS = ("elu", "relu", "selu", "gelu", "silu", "leaky_relu", "tanh", "sigmoid")
 MLP = {"frame_width": 45, "num_actions": 12, "hidden": [32, 16]}

@@ -18,6 +18,8 @@ from gaitgauge.policy.importing import import_policy
 from gaitgauge.policy.loading import load_policy
 from torch import nn
 
+pytestmark = pytest.mark.usefixtures("programs_run_here")
+
 EPISODES, RESET_STEP, RESET_ROW = 4, 6, 2
 
 
