@@ -296,7 +296,7 @@ FAULTS = [
     (MomentAboutTheOrigin, "contact/moment"),
     (FootForceCountedTwice, "contact/feet"),
     (KickingContacts, "contact/training"),
-    (TooFewIterations, "contact/training"),
+    pytest.param(TooFewIterations, "contact/training", marks=pytest.mark.slow),
     (LegsPass, "contact/legs"),
     (CondimIgnored, "contact/torsion"),
     (CondimNeverAboveThree, "contact/torsion"),

@@ -35,7 +35,7 @@ def backwards(tmp_path):
 
 @pytest.mark.usefixtures("few")
 def test_it_names_the_mistake_and_the_lines_to_change(run, backwards, tmp_path):
-    result = run("doctor", backwards, "--seconds", 1, "--threads", 1, "--out", tmp_path / "contract.toml")
+    result = run("doctor", backwards, "--seconds", 0.6, "--threads", 1, "--out", tmp_path / "contract.toml")
     assert result.exit_code == 1, result.output
     assert "the sign of actions looks wrong" in result.output
     assert "action_scale = [0.25, 0.25" in result.output

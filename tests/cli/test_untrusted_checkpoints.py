@@ -26,7 +26,9 @@ def stranger(trained: Path, folder: Path, **environment: object) -> Path:
     return folder / "model_2.pt"
 
 
-@pytest.mark.parametrize("place", ["generator", "level rule", "reward", "event"])
+@pytest.mark.parametrize(
+    "place", ["generator", *(pytest.param(p, marks=pytest.mark.slow) for p in ("level rule", "reward", "event"))]
+)
 def test_functions_that_a_checkpoint_names_are_not_imported(refused, run, trained, tmp_path, monkeypatch, place):
     monkeypatch.syspath_prepend(str(tmp_path))
     stored = torch.load(trained / "model_2.pt", weights_only=True)["training"]["settings"]["environment"]
@@ -100,7 +102,7 @@ def test_a_task_that_a_checkpoint_names_is_no_command_to_paste(refused, trained,
     assert "gaitgauge train evil_code" not in message
 
 
-@pytest.mark.parametrize("service", ["wandb", "neptune"])
+@pytest.mark.parametrize("service", ["wandb", pytest.param("neptune", marks=pytest.mark.slow)])
 def test_a_checkpoint_never_chooses_where_data_go(run, trained, tmp_path, monkeypatch, service):
     entries = torch.load(trained / "model_2.pt", weights_only=True)
     settings = entries["training"]["settings"]["training"]["run"]

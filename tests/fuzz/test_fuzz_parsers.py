@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, given, settings
 for module in sorted(Path(__file__).parent.glob("fuzz_*.py")):
     importlib.import_module(module.stem)
 
-CASES = -(-int(os.environ.get("GAITGAUGE_FUZZ_CASES", 300)) // len(PARSERS))
+CASES = -(-int(os.environ.get("GAITGAUGE_FUZZ_CASES", 150)) // len(PARSERS))
 """Of each parser; the variable says how many of all."""
 
 

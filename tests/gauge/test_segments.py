@@ -112,7 +112,7 @@ def outcome_of(told, segment, restarts):
 def test_any_order_of_completion_gives_what_playing_in_a_row_gives(name, falls, penetrations):
     chance, rules = random.Random(f"{name} {falls} {penetrations}"), rules_of(name)
     restarts = closes = name == REFERENCE
-    for _ in range(60):
+    for _ in range(30):
         goals = chance.choice([(DIAGONAL, MAXIMUM), (MAXIMUM,), (DIAGONAL,)])
         told = tale(chance, falls, penetrations)
         samples, fallen, restarted, overflowed = in_a_row(told, goals, closes, restarts)
@@ -395,7 +395,7 @@ def alone(request):
     return name, events, records
 
 
-@pytest.mark.parametrize("worlds", [7, 40])
+@pytest.mark.parametrize("worlds", [7, pytest.param(40, marks=pytest.mark.slow)])
 def test_worlds_and_neighbours_change_no_bit_of_a_record(alone, worlds):
     name, events, records = alone
     assert_equal(records, stage(name, worlds, *events, count=2))

@@ -94,12 +94,12 @@ class OverRows(Policy):
 
 def test_the_number_of_episodes_does_not_matter(policy):
     """To the last bit: in runs of 1 to 30 episodes, wholly or in part at work, with resets on the way."""
-    steps, most = 6, 30
+    steps, most = 5, 30
     width = policy.contract.observation_width
     observations = torch.randn(steps, most, width, generator=torch.Generator().manual_seed(1))
     results = {}
     with torch.inference_mode():
-        for count in (1, 5, 24, 30):
+        for count in (1, 5, 30):
             session, fewer = steady_session(policy, count)
             actions = []
             for step, observation in enumerate(observations[:, :count]):

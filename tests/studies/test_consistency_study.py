@@ -55,7 +55,7 @@ fall_tilt = 0.4
 [metrics]
 interval = 5
 [scoring]
-bootstrap = 400
+bootstrap = 100
 """
 FAST = 0.5
 """Speed at which the shifted engine lifts every robot [m/s]: an error of its velocity, whatever is commanded."""

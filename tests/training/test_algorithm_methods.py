@@ -157,7 +157,7 @@ FALLS = {"ac_moe": ("latent",), "mcp": ("latent",), "him": ("velocity", "contras
 FALLS["dreamwaq"] = ("velocity", "reconstruction")
 
 
-@pytest.mark.parametrize("method", FEW)
+@pytest.mark.parametrize("method", [m if m == "him" else pytest.param(m, marks=pytest.mark.slow) for m in NEW])
 def test_losses_fall_and_the_toy_is_learned(method):
     seen = []
     configuration = settings(method, steps=16, epochs=4, entropy_coefficient=0.0)

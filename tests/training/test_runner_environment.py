@@ -29,6 +29,7 @@ def build(folder, seed=0, observations=None, **algorithm):
     )
 
 
+@pytest.mark.slow
 def test_resumes_exactly_with_the_training_environment(tmp_path):
     whole, first, second = (tmp_path / name for name in ("whole", "first", "second"))
     for folder in (whole, first, second):
