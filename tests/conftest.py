@@ -1,6 +1,7 @@
 """What all tests share."""
 
 import gc
+import io
 import json
 import os
 import pickle
@@ -67,11 +68,13 @@ def robots_that_ship_are_read_once() -> Iterator[None]:
     """Nearly every test begins with one of them, and takes longer to read and compile it than for anything else."""
     import mujoco
     from gaitgauge.robots import Robot, loading, registry
+    from gaitgauge.robots.anatomy import body_plan
 
     own, folder = registry._own(), Path(registry.__file__).resolve().parent
     named, files, compiled = registry._named, loading.model_files, mujoco.MjModel.from_xml_path
     known, listed, model = cache(named), cache(files), cache(compiled)
     plain, digests = loading.robot_digest, {}
+    compile_robot, shape = body_plan.robot_model, cache(lambda mjcf: body_plan.physical_spec(mjcf).compile())
 
     def named_once(text: str) -> Robot:
         if text not in own:
@@ -85,6 +88,9 @@ def robots_that_ship_are_read_once() -> Iterator[None]:
     def ships(path: str | Path, *others: object) -> bool:
         return not any(others) and Path(path).is_relative_to(folder)
 
+    def robot_model(robot: Robot) -> mujoco.MjModel:
+        return copy(shape(robot.mjcf)) if ships(robot.mjcf) else compile_robot(robot)
+
     def model_files(mjcf: Path, *, within: Path | None = None) -> list[Path]:
         return list(listed(mjcf)) if ships(mjcf, within) else files(mjcf, within=within)
 
@@ -93,8 +99,12 @@ def robots_that_ship_are_read_once() -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(registry, "_named", named_once)
-        for module in ("robots.checks.checking", "gauge.evaluate", "studies.consistency.prepared"):
+        for module in (
+            *("robots.checks.checking", "robots.identity", "gauge.evaluate", "training.tasks"),
+            *("studies.consistency.prepared", "studies.compare.contestants", "studies.cards.verify"),
+        ):
             patch.setattr(f"gaitgauge.{module}.robot_digest", robot_digest)
+        patch.setattr(body_plan, "robot_model", robot_model)
         patch.setattr(loading, "model_files", model_files)
         patch.setattr(mujoco.MjModel, "from_xml_path", staticmethod(from_xml_path))
         yield
@@ -122,16 +132,32 @@ def noise_of_a_seed_is_drawn_once() -> Iterator[None]:
         yield
 
 
+class _Content(pickle.Pickler):
+    """Pickles a tensor as its numbers: torch writes the address of its memory, too."""
+
+    def reducer_override(self, value: object) -> Any:
+        if isinstance(value, torch.Tensor):
+            kind = f"{type(value)} {value.dtype} {tuple(value.shape)} {value.requires_grad}"
+            return bytes, (kind.encode() + value.detach().numpy().tobytes(),)
+        return NotImplemented
+
+
+def content(network: torch.nn.Module) -> bytes:
+    file = io.BytesIO()
+    _Content(file).dump(network)
+    return file.getvalue()
+
+
 @pytest.fixture(scope="session", autouse=True)
 def networks_are_recorded_once() -> Iterator[None]:
     """Most tests play one of a few networks, and recording it takes longer than what is played."""
-    from gaitgauge.policy import native
+    from gaitgauge.policy import batch_invariance, native
 
     plain, recorded = native.frozen, {}
 
     def frozen(network: torch.nn.Module, num_episodes: int) -> object:
         try:
-            place = num_episodes, pickle.dumps(network.eval())
+            place = num_episodes, content(network.eval())
         except (pickle.PicklingError, AttributeError, TypeError):  # made inside of a test
             return plain(network, num_episodes)
         if place not in recorded:
@@ -139,8 +165,22 @@ def networks_are_recorded_once() -> Iterator[None]:
             recorded[place] = None if made is network else made
         return network if recorded[place] is None else recorded[place]
 
+    same, found = batch_invariance._same, {}
+
+    def same_once(policy: Any, count: int) -> bool:
+        if type(policy) is not native.NativePolicy:
+            return same(policy, count)
+        try:
+            place = count, policy.contract.hash, content(policy.network.eval())
+        except (pickle.PicklingError, AttributeError, TypeError):
+            return same(policy, count)
+        if place not in found:
+            found[place] = same(policy, count)
+        return found[place]
+
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(native, "frozen", frozen)
+        patch.setattr(batch_invariance, "_same", same_once)
         yield
 
 
