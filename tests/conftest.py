@@ -9,7 +9,7 @@ import random
 import signal
 import sys
 from collections.abc import Callable, Iterator
-from copy import copy
+from copy import copy, deepcopy
 from functools import cache
 from importlib.metadata import EntryPoint, distributions
 from pathlib import Path
@@ -107,6 +107,27 @@ def robots_that_ship_are_read_once() -> Iterator[None]:
         patch.setattr(body_plan, "robot_model", robot_model)
         patch.setattr(loading, "model_files", model_files)
         patch.setattr(mujoco.MjModel, "from_xml_path", staticmethod(from_xml_path))
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def suites_that_ship_are_read_once() -> Iterator[None]:
+    """Every suite of a test's own extends one, whose text takes longer to read than all the rest."""
+    from gaitgauge.gauge import suite
+
+    plain, read = suite._tables, {}
+
+    def tables(name: str, behind: tuple[Path, ...]) -> tuple[Path, dict[str, Any]]:
+        if name not in ("gaitgauge-1", "robogauge-1.1"):
+            return plain(name, behind)
+        place = suite.SUITE_FOLDER, name
+        if place not in read:
+            read[place] = plain(name, ())
+        path, data = read[place]
+        return path, deepcopy(data)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(suite, "_tables", tables)
         yield
 
 
