@@ -17,25 +17,30 @@ SECONDS = 6.0
 """Length of the film [s]."""
 _LONGEST = 300.0
 """Longest time to make it [s]."""
-_PLAIN, _RICH, _NONE = 10.0, 4.0, 2.5
-"""Time of a film that a CPU draws, and a GPU, and until it is clear that nothing draws, on one core that does nothing else [s]."""
+_PLAIN, _RICH, _NONE = 4.0, 2.0, 0.5
+"""Time in which a CPU draws a film, and a GPU, and until it is clear that nothing draws [s]."""
 _SHOWIEST = ("stairs_fd", "obstacle", "wave", "slope_fd", "stairs_bd", "slope_bd")
 """Terrains in the order of preference."""
 _PACKAGE = __name__.partition(".")[0]
 
 
 class FilmTime:
-    """Estimate the time of a film; a process beside the evaluation finds out how this machine draws."""
+    """Estimate the time of a film; a process beside the evaluation finds out how this machine draws.
 
-    def __init__(self) -> None:
-        self.seconds = _PLAIN
+    Its command starts as slowly as the one that films: ``start`` [s].
+    """
+
+    def __init__(self, start: float) -> None:
+        self._start = start
+        self.seconds = start + _PLAIN
         threading.Thread(target=self._find, daemon=True).start()
 
     def _find(self) -> None:
         try:
-            self.seconds = _PLAIN if find_renderer()[1] is PLAIN else _RICH
+            drawing = _PLAIN if find_renderer()[1] is PLAIN else _RICH
         except UserError:
-            self.seconds = _NONE
+            drawing = _NONE
+        self.seconds = self._start + drawing
 
 
 def make_clip(folder: Path, result: Result, options: Sequence[str]) -> str | None:

@@ -46,7 +46,7 @@ def run_evaluation(request: Request, *, out: Path | None, resume: bool, clip: bo
     quiet = redirect_stdout(io.StringIO() if request.cluster else sys.stdout)
     with resumable(console, "gauging", folder, "--resume") as display, quiet:
         command = ["gaitgauge", *sys.argv[1:]]
-        film = FilmTime() if clip else None
+        film = FilmTime(display.start) if clip else None
         result = evaluate(prepared, folder, resume=resume, command=command, watch=shower(display, film))
         report = write_report(folder)
         sentence = _film(display, film.seconds, folder, request, result) if film else None
@@ -95,7 +95,7 @@ def shower(display: ProgressDisplay, film: FilmTime | None = None) -> Callable[[
     def show(status: Status) -> None:
         left = status.seconds_left
         if left is not None and film is not None:
-            left += film.seconds * max(status.slowness, 1.0)
+            left += film.seconds
         places = sorted({f"{e.terrain} L{e.level}" if e.level else e.terrain for e in status.active})
         running = ", ".join(places[:5]) + (f" and {len(places) - 5} more" if len(places) > 5 else "")
         text = f"{status.done} of about {status.expected} episodes"

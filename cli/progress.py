@@ -40,6 +40,8 @@ class ProgressDisplay:
         self._began = self._told = self._updated = clock()
         self._share, self._text = 0.0, "starting"
         self._left: float | None = None
+        self.start = 0.0
+        """Time from the command's beginning to that of its work [s]: Python and the packages are loaded in it."""
         self.closing = 0.0
         """Time that follows the work of which ``update`` tells the rest [s]."""
         self._details: Mapping[str, str] = {}
@@ -51,7 +53,8 @@ class ProgressDisplay:
         first, ProgressDisplay._first = self._first, None
         if first is not None:
             self._began, self._told = first._began, first._told
-            self.closing = _CLOSING * (self._clock() - self._began)
+            self.start = self._clock() - self._began
+            self.closing = _CLOSING * self.start
             first.close()
         self._open()
         return self

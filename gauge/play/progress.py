@@ -55,8 +55,6 @@ class Status:
     """Time since the evaluation began, or was gone on with [s]."""
     seconds_left: float | None
     """Estimated time until its end [s]; None while too little has been done to say."""
-    slowness: float = 1.0
-    """Time that control steps take over the time that they are expected to take."""
     remaining_work: float
     """Estimated share of the time that is left, 0 to 1."""
 
@@ -203,7 +201,6 @@ class ProgressMeter:
             active=tuple(active),
             seconds=seconds,
             seconds_left=left if known else None,
-            slowness=self.pace.scale,
             remaining_work=left / (seconds + left) if known and left > 0.0 else 0.0 if known else 1.0,
         )
 
