@@ -3,9 +3,11 @@
 import json
 import sys
 from pathlib import Path
+from unittest.mock import patch
 
 from gaitgauge.gauge.suite import load_suite
 from gaitgauge.studies.policies import file_digest
+from gaitgauge.training.sweep import jobs
 from gaitgauge.training.sweep.file import Sweep, SweepEntry
 from gaitgauge.training.sweep.jobs import Jobs
 from gaitgauge.training.sweep.runs import SweepRun
@@ -79,5 +81,6 @@ def scripted(folder: Path, name: str, *, seed: int = 0, on_gpu: bool = True) -> 
 
 def work(runs, *, gpus=("3", "5"), per_gpu=1, deadline=None):
     said = []
-    outcome = Jobs(SWEEP, threads=1, deadline=deadline, say=said.append, gpus=gpus, per_gpu=per_gpu).work(runs)
+    with patch.object(jobs, "_POLL", 0.01):  # the programs end sooner than it looks at them otherwise
+        outcome = Jobs(SWEEP, threads=1, deadline=deadline, say=said.append, gpus=gpus, per_gpu=per_gpu).work(runs)
     return outcome, said
