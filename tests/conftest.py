@@ -79,8 +79,10 @@ def robots_that_ship_are_read_once() -> Iterator[None]:
     def named_once(text: str) -> Robot:
         if text not in own:
             return named(text)
-        digests.setdefault(id(known(text)), plain(known(text)))
-        return known(text)
+        robot = known(text)
+        if id(robot) not in digests:
+            digests[id(robot)] = plain(robot)
+        return robot
 
     def robot_digest(robot: Robot) -> str:
         return digests.get(id(robot)) or plain(robot)

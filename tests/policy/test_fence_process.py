@@ -313,7 +313,8 @@ def test_a_step_that_fails_is_one_sentence_and_the_next_one_is_played(tmp_path):
         assert torch.equal(session.act(torch.zeros(2, 45)), action)
 
 
-def test_a_process_that_is_killed_is_missed(program):
+def test_a_process_that_is_killed_is_missed(program, monkeypatch):
+    monkeypatch.setattr(fence_child, "_LOOK_SECONDS", 0.05)
     session = program.session(2)
     os.kill(program._child._process.pid, signal.SIGKILL)
     for named in ("SIGKILL", "policy.pt"):
@@ -325,7 +326,8 @@ one_core = pytest.mark.skipif(sys.platform != "linux", reason="only Linux says o
 
 
 @one_core
-def test_a_program_shares_its_owners_core_and_leaves_it_free(program):
+def test_a_program_shares_its_owners_core_and_leaves_it_free(program, monkeypatch):
+    monkeypatch.setattr(fence_child, "_LOOK_SECONDS", 0.05)
     session, child = program.session(2), program._child._process.pid
     cores = os.sched_getaffinity(0)
     try:
