@@ -228,7 +228,7 @@ def test_an_error_that_cannot_be_told_keeps_its_exit_code(monkeypatch):
     assert ended.value.exit_code == 2
 
 
-@pytest.mark.parametrize("arguments", [("list", "suites"), pytest.param(("--version",), marks=pytest.mark.slow)])
+@pytest.mark.parametrize("arguments", [("list", "suites"), ("--version",)])
 def test_a_full_disk_behind_standard_output_is_one_sentence(arguments):
     with open("/dev/full", "w") as full:
         done = subprocess.run(

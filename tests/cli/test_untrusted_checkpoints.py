@@ -26,9 +26,7 @@ def stranger(trained: Path, folder: Path, **environment: object) -> Path:
     return folder / "model_2.pt"
 
 
-@pytest.mark.parametrize(
-    "place", ["generator", *(pytest.param(p, marks=pytest.mark.slow) for p in ("level rule", "reward", "event"))]
-)
+@pytest.mark.parametrize("place", ["generator", "level rule", "reward", "event"])
 def test_functions_that_a_checkpoint_names_are_not_imported(refused, run, trained, tmp_path, monkeypatch, place):
     monkeypatch.syspath_prepend(str(tmp_path))
     stored = torch.load(trained / "model_2.pt", weights_only=True)["training"]["settings"]["environment"]

@@ -60,7 +60,7 @@ def write(path: Path, module: nn.Module) -> Path:
     [
         pytest.param(InForward, False, marks=pytest.mark.slow),
         pytest.param(InReset, False, marks=pytest.mark.slow),
-        pytest.param(InSetstate, False, marks=pytest.mark.slow),
+        (InSetstate, False),
         (InForward, True),
         pytest.param(InReset, True, marks=pytest.mark.slow),
         pytest.param(InSetstate, True, marks=pytest.mark.slow),

@@ -108,7 +108,7 @@ def test_files_of_others_without_a_name_for_it_are_not_written(installed):
     assert mjlab_metadata(with_foot_load()) == {}
 
 
-@pytest.mark.parametrize("setting", ["foot_load", pytest.param("foot_load:FOOT_LOAD", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("setting", ["foot_load", "foot_load:FOOT_LOAD"])
 def test_a_training_uses_it_and_its_policy_plays(installed, setting, monkeypatch):
     monkeypatch.chdir(installed)
     command = [

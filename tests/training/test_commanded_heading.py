@@ -33,7 +33,7 @@ def test_who_turns_away_is_still_led_straight_ahead():
     assert memory.commanded_farthest.tolist() == pytest.approx([0.78] * 4, abs=1e-3)
 
 
-@pytest.mark.parametrize("turns", [pytest.param(0.0, marks=pytest.mark.slow), 4.0])
+@pytest.mark.parametrize("turns", [0.0, 4.0])
 def test_an_arc_leads_round_whether_the_robot_turns_or_not(turns):
     environment = make(4, script=gliding(0.0, 0.0, turns), rewards=RewardConfiguration(progress_along="command"))
     memory, ahead = commanded(environment, 1.0, 4.0)

@@ -34,7 +34,7 @@ def test_steps_of_another_depth_and_height():
     assert sum(box.wall for box in stairs.boxes) == 4
 
 
-@pytest.mark.parametrize("training", [pytest.param(False, marks=pytest.mark.slow), True])
+@pytest.mark.parametrize("training", [False, True])
 def test_a_walk_is_counted_from_where_it_sets_out(training):
     changes = Changes(training=training, gravity_noise=0.05, strength=0.2, push=0.4)
     walk = Walk("pretrained", ground("stairs", 1, changes), robots=2, friction=0.7, seed=0, changes=changes)

@@ -63,7 +63,7 @@ def edit(path, **training):
     torch.save(entries, path)
 
 
-@pytest.mark.parametrize("keep_episodes", [True, pytest.param(False, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("keep_episodes", [True, False])
 def test_another_number_of_processes_goes_on_with_schedules_and_levels(trained, tmp_path, keep_episodes):
     reached, path = trained(tmp_path, keep_episodes=keep_episodes)
     levels = reached.env.parts.memory.level
