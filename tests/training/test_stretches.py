@@ -139,6 +139,16 @@ def test_a_stretch_that_does_not_fit_is_refused_before_the_run(setting, words):
         make(num_envs=2, schedule=odd)
 
 
+def test_a_stretch_leaves_ground_alone_that_the_task_does_not_have():
+    """A task with tiles of its own inherits the last stretch of those on all terrains."""
+    task = find_task("go2-cts")
+    ground = task.environment.terrain
+    flat = replace(ground, tiles=tuple(tile for tile in ground.tiles if tile.name == "flat"))
+    found = settings_in(replace(task.environment, terrain=flat), 1)
+    assert [tile.name for tile in found.terrain.tiles] == ["flat"]
+    assert found.rewards.turn_error == -2.0 and found.terrain.tiles[0].share == 0.14
+
+
 def test_stretches_follow_in_order():
     late = ScheduleConfiguration(stretches=(replace(LAST, begin=0.7), LAST))
     with pytest.raises(

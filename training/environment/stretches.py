@@ -8,6 +8,7 @@ from ...files.parsing import shown
 from ...policy.comparing import difference
 from ...policy.contract import PolicyContract
 from ...robots.base import Robot
+from ...terrains.training_tiles import TILE_KINDS
 from ..configuration import ConfigurationError
 from ..overrides import apply_overrides
 from .configuration import EnvironmentConfiguration, ScheduleConfiguration
@@ -29,7 +30,7 @@ def stretch_at(schedule: ScheduleConfiguration, step: int) -> int:
 
 
 def settings_in(configuration: EnvironmentConfiguration, stretch: int) -> EnvironmentConfiguration:
-    """Return the settings after a number of stretches have begun.
+    """Return the settings after a number of stretches have begun; what they say of ground that the task does not have is left out.
 
     Raises:
         TaskError: an unknown key, or a value that does not fit.
@@ -41,7 +42,13 @@ def settings_in(configuration: EnvironmentConfiguration, stretch: int) -> Enviro
         raise ConfigurationError(
             f"environment.schedule.stretches begin at {begins} of the run; they must follow in order"
         )
-    settings = [setting for each in stretches[:stretch] for setting in each.settings.split()]
+    absent = TILE_KINDS.keys() - {tile.name for tile in configuration.terrain.tiles}
+    settings = [
+        setting
+        for each in stretches[:stretch]
+        for setting in each.settings.split()
+        if setting.removeprefix("environment.terrain.tiles.").split(".")[0] not in absent
+    ]
     for setting in settings:
         if setting.split(".")[0] != "environment" or setting.split(".")[1:2] not in [[name] for name in CHANGEABLE]:
             raise ConfigurationError(
