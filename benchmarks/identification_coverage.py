@@ -3,6 +3,7 @@
     python benchmarks/identification_coverage.py --draws 100 --processes 32
 
 Each draw is a Go2 with random constants, recorded hung up in two chirps with different kd, with noise and uneven times.
+``--draws-file`` gets a line for each draw as it ends; draws that stand there already are not repeated.
 """
 
 from __future__ import annotations
@@ -11,9 +12,9 @@ import argparse
 import json
 import os
 import time
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import replace
-from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -92,12 +93,20 @@ def main() -> None:
     parser.add_argument("--processes", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--seconds", type=float, default=8.0, help="length of each recording [s]")
     parser.add_argument("--first", type=int, default=0, help="seed of the first draw")
-    parser.add_argument("--json", help="file for all draws")
+    parser.add_argument("--draws-file", type=Path, default=Path("results/identification_coverage.jsonl"))
     options = parser.parse_args()
     began = time.perf_counter()
-    with ProcessPoolExecutor(options.processes) as pool:
-        seeds = range(options.first, options.first + options.draws)
-        found = list(pool.map(partial(identify_draw, seconds=options.seconds), seeds))
+    options.draws_file.parent.mkdir(parents=True, exist_ok=True)
+    lines = options.draws_file.read_text(encoding="utf-8").splitlines() if options.draws_file.exists() else []
+    seeds = range(options.first, options.first + options.draws)
+    done = {draw["seed"]: draw for draw in map(json.loads, lines) if draw["seed"] in seeds}
+    with ProcessPoolExecutor(options.processes) as pool, open(options.draws_file, "a", encoding="utf-8") as file:
+        left = [pool.submit(identify_draw, seed, options.seconds) for seed in seeds if seed not in done]
+        for draw in (task.result() for task in as_completed(left)):
+            done[draw["seed"]] = draw
+            file.write(json.dumps(draw) + "\n")
+            file.flush()
+    found = [done[seed] for seed in seeds]
     labels = list(dict.fromkeys(label for draw in found for label in (*draw["inside"], *draw["unknown"])))
     worst = 1.0
     for label in labels:
@@ -109,9 +118,6 @@ def main() -> None:
     near = sum(error <= HALF_STEP for error in errors)
     print(f"delays: {near} of {len(errors)} to half a step (1 ms), largest error {1e3 * max(errors):.2f} ms")
     print(f"least share inside {worst:.2f}; {options.draws} draws in {time.perf_counter() - began:.0f} s")
-    if options.json:
-        with open(options.json, "w", encoding="utf-8") as file:
-            json.dump(found, file)
 
 
 if __name__ == "__main__":
