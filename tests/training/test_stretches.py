@@ -19,7 +19,7 @@ from gaitgauge.training.run.request import TrainRequest
 from gaitgauge.training.run.resuming import resume_run
 from gaitgauge.training.run.runner import TrainingRunner
 from gaitgauge.training.run.seeding import seed_everything
-from gaitgauge.training.tasks import find_task
+from gaitgauge.training.tasks import find_task, scaling
 from gaitgauge_fake_engine import FakeBackend, FakeScript
 from small_environment import STAIRS, idle, make
 from toy_training import toy_configuration
@@ -100,7 +100,27 @@ def test_the_last_stretch_fits_other_robots(robot):
     whole = load_robot(robot)
     contract = training_contract(whole, joint_parameters(whole, settings), settings)
     check_stretches(settings, whole, contract)
-    assert settings_in(settings, 1).randomization.foot_torsion == (0.0, 1.0)
+    last = settings_in(settings, 1)
+    assert last.randomization.foot_torsion == (0.0, 1.0) and last.randomization.motor_speed == (1.0, 5.0)
+    assert last.rewards.joint_speed_limits == -0.15
+
+
+def test_a_robot_of_unknown_motor_speeds_has_a_last_stretch_without_them():
+    whole = load_robot("go1")
+    slow = replace(whole.parameters["gauge"], no_load_speed=None, full_torque_speed=None)
+    whole = replace(whole, parameters={"gauge": slow})
+    task = find_task("rough")
+    with patch.object(scaling, "load_robot", lambda name: whole if name == "go1" else load_robot(name)):
+        settings, _ = scaling.scaled(task.environment, task.training, "go1")
+    contract = training_contract(whole, slow, settings)
+    check_stretches(settings, whole, contract)
+    last = settings_in(settings, 1)
+    assert last.randomization.motor_speed == (1.0, 1.0) and last.rewards.joint_speed_limits == 0.0
+    assert last.rewards.turn_error == -2.0
+    judged = Stretch(name="judged", begin=0.5, settings="environment.rewards.joint_speed_limits=-1")
+    asked = replace(settings, schedule=ScheduleConfiguration(stretches=(judged,)))
+    with pytest.raises(ConfigurationError, match="does not say how fast its motors turn"):
+        check_stretches(asked, whole, contract)
 
 
 @pytest.mark.parametrize("stop", [2, pytest.param(3, marks=pytest.mark.slow), pytest.param(1, marks=pytest.mark.slow)])

@@ -18,8 +18,25 @@ from .curriculum import TrainingPalette
 from .feet import FootReader
 from .gait_rewards import pose_weights
 from .memory import EnvironmentMemory
-from .reward_configuration import FOOT_TERMS
+from .reward_configuration import FOOT_TERMS, RewardConfiguration
 from .step_inputs import StepInputs
+
+
+def soft_speed_limits(rewards: RewardConfiguration, robot: Robot, parameters: JointParameters) -> tuple[float, ...]:
+    """Return the joint speeds from which ``joint_speed_limits`` counts [rad/s], (J,); infinity where it has no weight.
+
+    Raises:
+        ConfigurationError: it has one, and the parameter set does not say how fast the motors turn.
+    """
+    if not rewards.joint_speed_limits:
+        return (math.inf,) * robot.num_joints
+    if parameters.no_load_speed is None:
+        raise ConfigurationError(
+            f"environment.rewards.joint_speed_limits is {rewards.joint_speed_limits:g}, but this parameter set of robot "
+            f"'{robot.name}' does not say how fast its motors turn; add full_torque_speed and no_load_speed to "
+            "robot.toml, or set it to 0"
+        )
+    return tuple(rewards.soft_speed_limit * speed for speed in parameters.no_load_speed)
 
 
 class StepReader:
@@ -64,7 +81,7 @@ class StepReader:
         limited = ranges.isfinite().all(dim=1)
         self._soft_lower = torch.where(limited, middle - half, lower)
         self._soft_upper = torch.where(limited, middle + half, upper)
-        self._soft_speed = self._speed_limit(robot, parameters)
+        self._soft_speed = torch.tensor(soft_speed_limits(self._settings, robot, parameters), device=device)
         plan = body_plan(robot)
         self._hips = self._indices(plan.abduction)
         pairs: list[tuple[int, int, float]] = []
@@ -91,17 +108,6 @@ class StepReader:
         distance = [leave if leave is not None and tile.ends else math.inf for tile in tiles]
         self._leave = torch.tensor(distance, device=device)[kind]
         self._can_be_stuck = torch.tensor([tile.stuck for tile in tiles], device=device)[kind]
-
-    def _speed_limit(self, robot: Robot, parameters: JointParameters) -> torch.Tensor:
-        if not self._settings.joint_speed_limits:
-            return torch.full((robot.num_joints,), math.inf, device=self._device)
-        if parameters.no_load_speed is None:
-            raise ConfigurationError(
-                f"environment.rewards.joint_speed_limits is {self._settings.joint_speed_limits:g}, but this parameter set of robot "
-                f"'{robot.name}' does not say how fast its motors turn; add full_torque_speed and no_load_speed to "
-                "robot.toml, or set it to 0"
-            )
-        return torch.tensor(parameters.no_load_speed, device=self._device) * self._settings.soft_speed_limit
 
     def _indices(self, found: Sequence[int] | Sequence[tuple[int, int]]) -> torch.Tensor:
         return torch.tensor(found, dtype=torch.int64, device=self._device)

@@ -63,6 +63,7 @@ def check_stretches(configuration: EnvironmentConfiguration, robot: Robot, contr
     ConfigurationError, TaskError: one sentence.
     """
     from .policy_interface import joint_parameters, training_contract  # loads torch, which a refusal must not wait for
+    from .step_reader import soft_speed_limits
 
     for number in range(len(configuration.schedule.stretches) + 1):
         settings = settings_in(configuration, number)
@@ -80,7 +81,9 @@ def check_stretches(configuration: EnvironmentConfiguration, robot: Robot, contr
                 f"stretch {name} of environment.schedule has {settings.terrain.levels} levels of terrain, the run begins with "
                 f"{configuration.terrain.levels}; give environment.terrain.levels for the whole run"
             )
-        its = training_contract(robot, joint_parameters(robot, settings), settings)
+        parameters = joint_parameters(robot, settings)
+        soft_speed_limits(settings.rewards, robot, parameters)
+        its = training_contract(robot, parameters, settings)
         if lines := difference(its, contract):
             raise ConfigurationError(
                 f"stretch {name} of environment.schedule makes another policy contract ({lines.splitlines()[0]}); give that "

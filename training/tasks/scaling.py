@@ -12,8 +12,11 @@ from ...robots.anatomy.body_plan import body_plan
 from ..configuration import Ramp, Range, TrainingConfiguration
 from ..environment.configuration import CommandStage, EnvironmentConfiguration
 from ..environment.reward_configuration import FOOT_TERMS
+from ..environment.stretches import without
 
 Triple = tuple[float, float, float]
+_OF_MOTOR_SPEEDS = {"environment.randomization.motor_speed", "environment.rewards.joint_speed_limits"}
+"""Settings of stretches that a robot has no use for if its description does not say how fast its motors turn."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,7 +66,8 @@ def scaled(
     Scaled are the height of the base with the legs' reach; the place to start on with the stance; steps with legs and stance; masses
     that are added; penalties on torque and power with the robot's load; penalties on actions with the angle that an action is; contact
     forces that teacher and critic see; and commands with the robot's own limits. Terrain is not: every robot meets the ground that the
-    gauge has. The parameter set is the robot's default one where it has none of the name that the task asks for.
+    gauge has. The parameter set is the robot's default one where it has none of the name that the task asks for. Stretches leave out
+    what goes by the speeds of the motors where it does not have them.
 
     Args:
         environment: settings for ``environment.robot``.
@@ -111,14 +115,16 @@ def _scaled_environment(
     environment: EnvironmentConfiguration, robot: Robot, source: str, by: Ratios
 ) -> EnvironmentConfiguration:
     environment = _with_steps(environment, by)
-    rewards, randomization, commands = environment.rewards, environment.randomization, environment.commands
     parameters, (length, width) = environment.joints.parameters, environment.reset.footprint
+    if parameters not in robot.parameters:
+        parameters = robot.default_parameters
+    if robot.parameters[parameters].no_load_speed is None:
+        environment = without(environment, _OF_MOTOR_SPEEDS)
+    rewards, randomization, commands = environment.rewards, environment.randomization, environment.commands
     return replace(
         environment,
         robot=source,
-        joints=replace(
-            environment.joints, parameters=parameters if parameters in robot.parameters else robot.default_parameters
-        ),
+        joints=replace(environment.joints, parameters=parameters),
         observations=replace(
             environment.observations,
             foot_force_scale=environment.observations.foot_force_scale / by.mass,
