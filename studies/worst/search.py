@@ -1,14 +1,14 @@
 """Search by quality and diversity: an archive with one cell for each set of factors (MAP-Elites, Mouret and Clune 2015).
 
-A cell keeps the case that comes closest to a fall, and of those that fall the mildest: the search looks for failures that need
-few factors and little of each. Everything here is a pure function of a generator of random numbers.
+A cell keeps the case that comes closest to a fall, and of those that fall with several seeds the mildest: the search looks for
+failures that need few factors and little of each, and not for luck. Everything here is a pure function of a generator of random numbers.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,6 +50,8 @@ class Elite:
 
     case: Case
     outcome: Outcome
+    sure: bool = False
+    """It fell with every seed of the search, not with the first alone."""
 
 
 @dataclass
@@ -67,13 +69,18 @@ class Archive:
                 self.cells[elite.case.factors] = elite
 
     def quality(self, elite: Elite) -> float:
-        """Return 1 to 2 for a fall, more for a milder case; else how far the robot leaned, 0 to 1."""
-        return 2.0 - hardness(elite.case, self.ranges) if elite.outcome.fell else elite.outcome.lean
+        """Return 1 to 2 for a sure fall, more for a milder case; else how far the robot leaned, 0 to 1."""
+        return 2.0 - hardness(elite.case, self.ranges) if elite.sure else elite.outcome.lean
+
+    def wants(self, elite: Elite) -> bool:
+        """Return whether a case that fell would be the best of its cell if it fell with every seed."""
+        held = self.cells.get(elite.case.factors)
+        return held is None or self.quality(replace(elite, sure=True)) > self.quality(held)
 
     @property
     def failures(self) -> list[Elite]:
-        """Return the cases that fall, those of the fewest factors first, then the mildest."""
-        fallen = [elite for elite in self.cells.values() if elite.outcome.fell]
+        """Return the cases that surely fall, those of the fewest factors first, then the mildest."""
+        fallen = [elite for elite in self.cells.values() if elite.sure]
         return sorted(fallen, key=lambda e: (len(e.case.factors), hardness(e.case, self.ranges), e.case.name))
 
     def propose(self, random: np.random.Generator, names: Sequence[str]) -> list[Case]:
@@ -103,7 +110,7 @@ class Archive:
         elif chance > 1.0 - _DROP and len(factors) > 1:
             factors.remove(str(random.choice(sorted(factors))))
         share = random.uniform(0.0, _PULL)
-        return self._moved(random, name, values, factors, outwards=not elite.outcome.fell, share=share, reach=_REACH)
+        return self._moved(random, name, values, factors, outwards=not elite.sure, share=share, reach=_REACH)
 
     def _moved(
         self,
@@ -205,7 +212,7 @@ def choose_different(cases: Sequence[Case], ranges: Ranges, most: int) -> list[i
 
 @dataclass
 class Reduction:
-    """Take factors away from a case that falls as long as it falls without them."""
+    """Take factors away from a case that falls as long as it surely falls without them."""
 
     elite: Elite
     random: np.random.Generator
@@ -225,11 +232,11 @@ class Reduction:
         """Return the case to play next; None where each factor is needed."""
         return self.elite.case.without(self.queue[0]) if self.queue else None
 
-    def tell(self, outcome: Outcome) -> None:
+    def tell(self, tried: Elite) -> None:
         """Take in what came of it."""
-        factor = self.queue.pop(0)
-        if outcome.fell:
-            self.elite, self._changed = Elite(self.elite.case.without(factor), outcome), True
+        self.queue.pop(0)
+        if tried.sure:
+            self.elite, self._changed = tried, True
         if not self.queue and self._changed:
             self._refill()
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass, field
-from itertools import islice
+from dataclasses import asdict, dataclass, field, replace
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any
 
@@ -47,8 +47,10 @@ from .search import (
 from .sentences import sentences
 
 SCHEMA = 1
-SEEDS = 6
-"""Seeds with which a failure of the gallery is played: its own, 0, and five more."""
+SEARCHED = (range(1), range(1, 2), range(2, 6))
+"""Seeds of the search, in the order in which they are played: a case is a failure if the robot falls with each of them."""
+CONFIRMING = range(6, 12)
+"""Seeds with which a failure of the gallery is played again: the search has seen none of them."""
 GALLERY = 10
 """Failures that are filmed."""
 _SAMPLED = 0.35
@@ -57,7 +59,7 @@ _NEEDED, _SETTLED = 0.5, 0.85
 """Shares of the budget at which it is no longer asked what the falls of the sample need, and what those of the search need."""
 _ROUNDS = 3
 """Rounds of such questions that are played in any case: enough for up to two factors."""
-_REST, _REST_PLAYS = 0.4, 330
+_REST, _REST_PLAYS = 0.4, 500
 """Largest share of the budget that is left to what follows the search, and about the plays that it takes."""
 _LEAST_SAMPLE, _MOST_SAMPLE = 30, 10_000
 """Least and largest number of cases of the random sample; 30 without a fall bound its probability by 10 %."""
@@ -251,7 +253,7 @@ class _Search:
             v.label: self._play("sampled falls in other engines", [e.case for e in fallen], engine=v)
             for v in self.prepared.others
         }
-        self._reduce("what falls of the sample need", fallen[:_REDUCED], _NEEDED)
+        self._reduce("what falls of the sample need", fallen[:_REDUCED], _NEEDED, SEARCHED[:2])
         self._explore()
         self._reduce("what each failure needs", self.archive.failures, _SETTLED)
         failures = self._needed.failures
@@ -278,6 +280,13 @@ class _Search:
         self._report(stage)
         return found
 
+    def _fell(
+        self, stage: str, cases: Sequence[Case], seeds: Sequence[int], engine: Variant | None = None
+    ) -> list[list[bool]]:
+        """Return for each case whether the robot fell, by seed."""
+        outcomes = iter(self._play(stage, cases, engine=engine, seeds=seeds))
+        return [[next(outcomes).fell for _ in seeds] for _ in cases]
+
     def _report(self, stage: str) -> None:
         left = max(self._budget - self.used, 0.0)
         share = min(self.used / self._budget, 1.0)
@@ -303,11 +312,28 @@ class _Search:
         while not self.generations or self.used < self._budget - self._rest:
             names = [f"search-{self.generations}-{i}" for i in range(self._batch)]
             cases = self.archive.propose(self._random(2, self.generations), names)
-            self.archive.add(_elites(cases, self._play("search", cases)))
+            played = _elites(cases, self._play("search", cases))
+            self.archive.add(self._assure("search", played, self.archive.wants))
             self.generations += 1
 
-    def _reduce(self, stage: str, elites: Sequence[Elite], end: float) -> None:
-        """Take from cases that fall what their falls do not need, first from those at the front.
+    def _assure(
+        self,
+        stage: str,
+        elites: Sequence[Elite],
+        wanted: Callable[[Elite], bool] = lambda _: True,
+        turns: Sequence[Sequence[int]] = SEARCHED,
+    ) -> list[Elite]:
+        """Return cases that were played with the first seed; those that fell and are wanted are played with the others too."""
+        sure = [elite.case for elite in elites if elite.outcome.fell and wanted(elite)]
+        for seeds in turns[1:]:
+            fell = self._fell(stage, sure, seeds)
+            sure = [case for case, own in zip(sure, fell, strict=True) if all(own)]
+        return [replace(elite, sure=elite.case in sure) for elite in elites]
+
+    def _reduce(
+        self, stage: str, elites: Sequence[Elite], end: float, seeds: Sequence[Sequence[int]] = SEARCHED
+    ) -> None:
+        """Take from cases that fall what their falls, with some of the search's seeds, do not need; from those at the front first.
 
         What remains goes into the archive. Those that are not done at the share ``end`` of the budget wait.
         """
@@ -317,10 +343,15 @@ class _Search:
             if rounds >= _ROUNDS and self.used >= end * self._budget:
                 break
             rounds += 1
-            for (reduction, _), outcome in zip(turns, self._play(stage, [case for _, case in turns]), strict=True):
-                reduction.tell(outcome)
-        self.archive.add([reduction.elite for reduction in reductions])
-        self._needed.add([reduction.elite for reduction in reductions if reduction.next is None])
+            cases = [case for _, case in turns]
+            played = self._assure(stage, _elites(cases, self._play(stage, cases)), turns=seeds)
+            for (reduction, _), tried in zip(turns, played, strict=True):
+                reduction.tell(tried)
+        left = [reduction.elite for reduction in reductions]
+        if seeds != SEARCHED:
+            left = self._assure(stage, left)
+        self.archive.add(left)
+        self._needed.add([elite for elite, done in zip(left, reductions, strict=True) if done.next is None])
 
     @property
     def _rest(self) -> float:
@@ -333,24 +364,35 @@ class _Search:
         return max(self.used / max(self.played, 1), 1e-6)
 
     def _again(self, failures: Sequence[Elite]) -> dict[str, Any]:
-        """Play every failure again in all engines, and those that differ with more seeds."""
+        """Play every failure with a new seed in all engines, and those that differ with more seeds."""
         engines = [self.prepared.engine, *self.prepared.others]
         cases = [elite.case for elite in failures]
         again: dict[str, dict[str, list[bool]]] = {case.name: {} for case in cases}
         for engine in engines:
-            for case, outcome in zip(cases, self._play("failures again", cases, engine=engine), strict=True):
-                again[case.name][engine.label] = [outcome.fell]
-        confirmed = [case for case in cases if again[case.name][self.prepared.engine.label][0]]
-        more = range(1, SEEDS)
+            fell = self._fell("failures again", cases, CONFIRMING[:1], engine)
+            for case, own in zip(cases, fell, strict=True):
+                again[case.name][engine.label] = own
+        here, more = self.prepared.engine.label, CONFIRMING[1:]
+        fell_again = [case for case in cases if again[case.name][here][0]]
         time_for = int((self._budget - self.used) / (self._each * len(more) * len(engines)))
-        most = min(max(time_for, GALLERY // 2), GALLERY + 2)
-        chosen = [confirmed[i] for i in choose_different(confirmed, self.prepared.ranges, most)]
-        for engine in engines:
-            outcomes = self._play("failures with other seeds", chosen, engine=engine, seeds=more)
-            for at, case in enumerate(chosen):
-                own = outcomes[at * len(more) : (at + 1) * len(more)]
-                again[case.name][engine.label] += [outcome.fell for outcome in own]
-        return {"again": again, "chosen": [case.name for case in chosen]}
+        most = min(max(time_for, GALLERY // 2), 2 * GALLERY)
+        chosen: list[Case] = []
+        while True:  # those that are not confirmed make room for others
+            held = [case for case in chosen if _confirmed(again[case.name][here])]
+            tried = held + [case for case in fell_again if case not in chosen]
+            new = [tried[i] for i in choose_different(tried, self.prepared.ranges, GALLERY) if i >= len(held)]
+            if not (new := new[: most - len(chosen)]):
+                return {"again": again, "chosen": [case.name for case in chosen]}
+            for engine in engines:
+                fell = self._fell("failures with other seeds", new, more, engine)
+                for case, own in zip(new, fell, strict=True):
+                    again[case.name][engine.label] += own
+            chosen += new
+
+
+def _confirmed(fell: Sequence[bool]) -> bool:
+    """Return whether a robot fell with at least half of the confirming seeds; False where some were not played."""
+    return len(fell) == len(CONFIRMING) and 2 * sum(fell) >= len(fell)
 
 
 def _elites(cases: Sequence[Case], outcomes: Iterable[Outcome]) -> list[Elite]:
@@ -380,7 +422,8 @@ def _results(prepared: PreparedSearch, search: _Search, found: _Found, command: 
         "rules": {
             "cause_apart": CAUSE_APART,
             "values_apart": VALUES_APART,
-            "seeds": SEEDS,
+            "searched_seeds": list(chain(*SEARCHED)),
+            "seeds": list(CONFIRMING),
             "confidence": CONFIDENCE,
         },
         "sample": {
@@ -416,7 +459,7 @@ def _failure(prepared: PreparedSearch, elite: Elite, found: _Found) -> dict[str,
         "seconds": elite.outcome.seconds,
         "diverged": elite.outcome.diverged,
         "again": again,
-        "confirmed": len(here) == SEEDS and 2 * sum(here) >= SEEDS,
+        "confirmed": _confirmed(here),
         "only_here": bool(elsewhere) and not any(elsewhere),
         "rank": None,
         "scenario": None,

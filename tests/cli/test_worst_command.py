@@ -17,7 +17,7 @@ def late_ones_fall(monkeypatch):
         return [Outcome(fell=fell, diverged=False, seconds=2.0, lean=0.5) for fell in falls]
 
     monkeypatch.setattr(study.Players, "play", play)
-    monkeypatch.setattr("time.perf_counter", itertools.count().__next__)
+    monkeypatch.setattr("time.perf_counter", itertools.count(0.0, 0.25).__next__)
 
 
 def test_table_sentences_and_files(run, refused, policy, late_ones_fall, tmp_path):

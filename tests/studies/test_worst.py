@@ -1,8 +1,8 @@
 """The search for failures of robots that fall by a rule: what it must find is known."""
 
-import itertools
 import json
 import math
+import random
 
 import numpy as np
 import pytest
@@ -58,16 +58,16 @@ def standing(tmp_path_factory):
 
 @pytest.fixture
 def searched(standing, monkeypatch):
-    """A search in which a rule says of each scenario and engine whether the robot falls; each batch takes a second."""
+    """A search in which a rule says of each scenario and engine whether the robot falls; 32 plays take a second."""
     plays = []
 
     def search(rule, folder, *, resume=False, minutes=1.5, others=("mujoco@foot_condim=3",), seed=0):
         def play(players, pairs, variant):
             plays.extend((scenario.name, s, variant.label) for scenario, s in pairs)
-            return [FALLEN if rule(scenario, variant.label) else UPRIGHT for scenario, _ in pairs]
+            return [FALLEN if rule(scenario, variant.label, s) else UPRIGHT for scenario, s in pairs]
 
         monkeypatch.setattr(study.Players, "play", play)
-        monkeypatch.setattr("time.perf_counter", itertools.count().__next__)
+        monkeypatch.setattr("time.perf_counter", lambda: len(plays) / 32.0)
         request = WorstRequest(policy=standing, minutes=minutes, others=others, threads=1, device="cpu", seed=seed)
         return study.search_worst(request, folder, resume=resume)
 
@@ -79,7 +79,7 @@ def newtons(scenario):
     return math.hypot(*(force.newtons[0] for force in scenario.forces)) if scenario.forces else 0.0
 
 
-def frail(scenario, engine):
+def frail(scenario, engine, seed=0):
     """Falls under a heavy load, in one engine alone; late; or pushed on slippery ground."""
     heavy = scenario.payload is not None and scenario.payload.kilograms > 2.0 and "@" not in engine
     late = scenario.latency is not None and scenario.latency > 0.03
@@ -89,7 +89,7 @@ def frail(scenario, engine):
 def test_the_search_finds_what_each_fall_needs_and_nothing_else(searched, tmp_path):
     played = {}
 
-    def keep(scenario, engine):
+    def keep(scenario, engine, _):
         fell = frail(scenario, engine)
         if fell:
             played[scenario.name, scenario.title] = scenario
@@ -106,7 +106,7 @@ def test_the_search_finds_what_each_fall_needs_and_nothing_else(searched, tmp_pa
     assert all(f["confirmed"] for f in found.values())
     assert [k for k, f in found.items() if f["only_here"]] == [frozenset({"payload"})]
     # milder than most that fall, and still falling
-    assert 0.03 < found[frozenset({"latency"})]["values"]["latency"] < 0.033
+    assert 0.03 < found[frozenset({"latency"})]["values"]["latency"] < 0.04
     assert sorted(f["rank"] for f in results["failures"]) == [1, 2, 3] and found[frozenset({"payload"})]["rank"] == 3
     assert found[frozenset({"payload"})]["again"]["mujoco"] == [True] * 6
     assert results == json.loads((tmp_path / "out" / "worst.json").read_text())
@@ -131,8 +131,22 @@ def test_a_robot_that_always_falls_needs_no_condition(searched, tmp_path):
     assert "It falls where nothing is unusual." in results["sentences"]
 
 
+def test_falls_by_luck_are_no_failures(searched, tmp_path):
+    """Late actions always fell the robot; half as late ones, and loads, do with one seed in four."""
+
+    def lucky(scenario, engine, seed):
+        late = scenario.latency or 0.0
+        unlucky = random.Random(f"{scenario.name} {seed}").random() < 0.25
+        return late > 0.04 or (unlucky and (late > 0.02 or scenario.payload is not None))
+
+    results = searched(lucky, tmp_path / "out")
+    alone = {failure["factors"][0]: failure for failure in results["failures"] if len(failure["factors"]) == 1}
+    assert alone["latency"]["confirmed"] and alone["latency"]["values"]["latency"] > 0.035
+    assert alone["latency"]["rank"] == 1 and not any(f["confirmed"] for k, f in alone.items() if k != "latency")
+
+
 def test_a_small_budget_finds_what_falls_alone(searched, tmp_path):
-    results = searched(lambda scenario, _: scenario.latency is not None, tmp_path / "out", minutes=0.1)
+    results = searched(lambda scenario, *_: scenario.latency is not None, tmp_path / "out", minutes=0.1)
     assert [failure["factors"] for failure in results["failures"]] == [["latency"]]
 
 
@@ -192,7 +206,7 @@ def test_what_a_fall_does_not_need_is_taken_away():
     case = make_case("one", values, ("latency", "friction", "payload", "slope"))
     reduction = Reduction(Elite(case, FALLEN), np.random.default_rng(0))
     while (tried := reduction.next) is not None:
-        reduction.tell(FALLEN if {"friction", "slope"} <= tried.factors or "latency" in tried.factors else UPRIGHT)
+        reduction.tell(Elite(tried, FALLEN, {"friction", "slope"} <= tried.factors or "latency" in tried.factors))
     assert reduction.elite.case.factors in ({"latency"}, {"friction", "slope"})
     assert reduction.elite.case.named["payload"] == 0.0
 
