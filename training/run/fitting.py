@@ -14,9 +14,9 @@ SKIPPED, MEASURED = 10, 30
 """Iterations done before the speed is measured, and when it is known."""
 SLOWER = 1.4
 """Time of an iteration in a later stretch over one in the first: its contacts cost more."""
-BUILDING = 60.0
+BUILDING = 40.0
 """Time to build the worlds of a later stretch [s]."""
-USED = 0.95
+USED = 0.97
 """Share of the limit to fill."""
 
 
