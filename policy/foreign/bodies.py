@@ -41,6 +41,14 @@ def choose_robot(asked: Robot | None, named: str | None, source: object) -> Robo
     return load_robot(known)
 
 
+def wheeled_robot(source: object) -> tuple[Robot, str | None]:
+    """Return the robot of a description that drives wheels and names none, and what that assumes: the installed one with wheels."""
+    wheeled = [robot for robot in map(load_robot, robot_names()) if robot.velocity_joints]
+    if len(wheeled) == 1:
+        return wheeled[0], f"robot '{wheeled[0].name}', the one with wheels that is installed"
+    return choose_robot(None, None, source), None
+
+
 def _same(named: str, name: str) -> bool:
     """Return whether a robot's name is the one that a description uses, with an addition of its owner's or without."""
     return _bare(named) == _bare(name) or re.match(rf"{re.escape(named.lower())}[_.-]", name.lower()) is not None

@@ -12,7 +12,7 @@ from ...robots.base import Robot
 from ..base import PolicyError
 from ..contract import History, HistoryOrder, ObservationTerm, Part, PolicyContract, without_wheels
 from ..observation_table import HEIGHT_SCAN, WITHOUT_WHEELS
-from .bodies import choose_robot, sdk_joints, wheels_of
+from .bodies import choose_robot, sdk_joints, wheeled_robot, wheels_of
 from .terms import ISAAC_HEIGHT, checked, clip_before_scaling, listed, own_term, symmetric, usual_scan
 
 
@@ -35,7 +35,9 @@ def read_deploy(data: Mapping[str, Any], path: Path, asked: Robot | None, *, of_
     In it ``stiffness`` and ``damping`` are in the order of the robot's SDK, everything else is in the policy's; entry i
     of ``joint_ids_map`` is the SDK's number of the policy's joint i. Histories are term-major unless
     ``use_gym_history`` is set, and start with copies of the first observation. Clipping comes before scaling unless
-    ``scale_first`` is set; a clip of the action limits the joint target. ``JointVelocityAction`` drives wheels.
+    ``scale_first`` is set; a clip of the action limits the joint target. ``JointVelocityAction`` drives wheels; lists of the
+    legs alone are completed with the robot's gains and pose of its wheels. Without ``asked``, the robot is the Go2, or the one
+    installed robot with wheels.
 
     Args:
         of_mjlab: the policy's file has mjlab's metadata; unitree_rl_mjlab's gait phase is zero while the command is.
@@ -44,14 +46,37 @@ def read_deploy(data: Mapping[str, Any], path: Path, asked: Robot | None, *, of_
         PolicyError: the file is malformed, or asks for something that a contract cannot express.
     """
     with checked(path, "deploy.yaml"):
-        contract = _read(data, path, choose_robot(asked, None, path))
-    if not of_mjlab or not any(term.name == "gait_phase" for term in contract.observation):
-        return contract
-    terms = tuple(replace(t, at_rest="zeros") if t.name == "gait_phase" else t for t in contract.observation)
-    told = "; ".join(
-        filter(None, (contract.provenance.get("assumed"), "the gait phase is zero at rest, as unitree_rl_mjlab has it"))
-    )
-    return replace(contract, observation=terms, provenance={**contract.provenance, "assumed": told})
+        turned = dict(data["actions"]).get(_TURNED) is not None
+        robot, chosen = wheeled_robot(path) if turned and asked is None else (choose_robot(asked, None, path), None)
+        data, completed = _with_wheels(data, robot) if turned else (data, None)
+        contract = _read(data, path, robot)
+    assumed = [contract.provenance.get("assumed"), chosen, completed]
+    if of_mjlab and any(term.name == "gait_phase" for term in contract.observation):
+        terms = tuple(replace(t, at_rest="zeros") if t.name == "gait_phase" else t for t in contract.observation)
+        contract = replace(contract, observation=terms)
+        assumed.append("the gait phase is zero at rest, as unitree_rl_mjlab has it")
+    told = "; ".join(filter(None, assumed))
+    return replace(contract, provenance={**contract.provenance, "assumed": told}) if told else contract
+
+
+def _with_wheels(data: Mapping[str, Any], robot: Robot) -> tuple[Mapping[str, Any], str | None]:
+    """Return the settings with the wheels that an action numbers behind lists of the legs alone, and what was added, in words."""
+    legs, numbered = list(data["joint_ids_map"]), robot.sdk_joint_names or ()
+    wheels = sorted(listed(data["actions"][_TURNED].get("joint_ids"), -1))
+    both = [*range(len(legs)), *wheels]
+    if both != list(range(len(numbered))) or {numbered[i] for i in wheels} != set(robot.velocity_joints or ()):
+        return data, None
+    motors, index = robot.parameters[robot.default_parameters], [robot.joint_names.index(numbered[i]) for i in wheels]
+    added = {
+        "default_joint_pos": robot.default_joint_position,
+        "stiffness": motors.stiffness,
+        "damping": motors.damping,
+    }
+    complete = {**data, "joint_ids_map": [*legs, *wheels]}
+    for key, own in added.items():
+        if len(data[key]) == len(legs):
+            complete[key] = [*data[key], *(own[i] for i in index)]
+    return complete, f"gains of the wheels of robot '{robot.name}', because its lists hold {len(legs)} joints"
 
 
 def _read(data: Mapping[str, Any], path: Path, robot: Robot) -> PolicyContract:
@@ -129,12 +154,13 @@ def _read(data: Mapping[str, Any], path: Path, robot: Robot) -> PolicyContract:
     )
 
 
-_ACTIONS = ("JointPositionAction", "JointVelocityAction")
+_TURNED = "JointVelocityAction"
+_ACTIONS = ("JointPositionAction", _TURNED)
 
 
 def _wheels(actions: Mapping[str, Any], names: Sequence[str], robot: Robot, path: Path) -> Sequence[object]:
     """Return what a file says of the joints that it drives by velocity: their numbers in the policy's order, else names or patterns."""
-    action = actions.get("JointVelocityAction")
+    action = actions.get(_TURNED)
     if action is None:
         return []
     numbered = _joints(action, names, path) if robot.velocity_joints else []
@@ -164,7 +190,7 @@ def _joined(
     found: dict[str, list[Any]] = {"scale": [], "offset": [], "clip": []}
     order: list[str] = []
     for kind in (kind for kind in actions if kind in _ACTIONS):
-        action, turned = actions[kind], kind == "JointVelocityAction"
+        action, turned = actions[kind], kind == _TURNED
         mine = _joints(action, names, path) or [n for n in names if (n in wheels) == turned]
         order += mine
         usual = [0.0 if turned else default[names.index(n)] for n in mine]

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from ...robots.base import Robot
@@ -86,7 +87,7 @@ def _holosoma_contract(
         command_limits=(limits[0], limits[1], limits[2]),
         provenance={
             "adapter": "holosoma metadata",
-            "file": source,
+            "file": Path(source).name,
             "assumed": f"observation of holosoma's controller for {family.upper()}, gait cycle {_PERIOD:g} s, control period 0.02 s, "
             f"standing pose of robot '{robot.name}'" + ("" if ranges else " and its command limits"),
         },

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from pathlib import Path
 
 from ...robots.base import Robot
 from ..base import PolicyError
@@ -72,7 +73,7 @@ def _mjlab_contract(metadata: Mapping[str, str], robot: Robot, source: str) -> P
         command_limits=robot.command_limits,
         provenance={
             "adapter": "mjlab metadata",
-            "file": source,
+            "file": Path(source).name,
             "assumed": ", ".join(assumed),
         },
     )

@@ -103,24 +103,10 @@ def test_histories_of_different_lengths_in_a_deploy_file(tmp_path):
     check(policy, isaac, stack, simply(module))
 
 
-@pytest.mark.parametrize(
-    ("changes", "sentence"),
-    [
-        (
-            {"actions": {"JointVelocityAction": {"joint_names": [".*_wheel_joint"], "joint_ids": [12, 13, 14, 15]}}},
-            "drives joints by velocity (.*_wheel_joint), as wheels are, and robot 'go2' takes targets of angle alone",
-        ),
-        (
-            {"terms": {"camera": {"params": {}, "scale": 1.0}}},
-            "asks for the observation 'camera'; supported are",
-        ),
-    ],
-)
-def test_what_a_deploy_file_asks_for_in_vain_is_named(tmp_path, changes, sentence):
-    (tmp_path / "deploy.yaml").write_text(deploy(**changes))
-    with pytest.raises(PolicyError) as caught:
+def test_what_a_deploy_file_asks_for_in_vain_is_named(tmp_path):
+    (tmp_path / "deploy.yaml").write_text(deploy(terms={"camera": {"params": {}, "scale": 1.0}}))
+    with pytest.raises(PolicyError, match="asks for the observation 'camera'; supported are"):
         load_policy(script(tmp_path / "policy.pt", network(45)))
-    assert sentence in str(caught.value)
 
 
 def test_two_descriptions_that_disagree(tmp_path):

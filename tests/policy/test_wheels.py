@@ -49,6 +49,31 @@ def test_a_deploy_file_keeps_legs_and_wheels():
         deploy_settings(mixed, GO2W)
 
 
+def test_lists_of_the_legs_alone_get_the_robots_own_wheels():
+    """The wheels' action numbers four joints behind the twelve of all lists; no list says their gains."""
+    settings = deploy_settings(standard_contract(GO2), GO2)
+    settings["actions"]["JointVelocityAction"] = {
+        "joint_names": [".*_wheel_joint"], "joint_ids": [12, 13, 14, 15], "scale": 5.0, "offset": 0.0, "clip": None
+    }  # fmt: skip
+    for term in settings["observations"].values():
+        if len(term["scale"]) == 12:
+            term["scale"] = term["scale"][:1]
+    contract = read_deploy(settings, Path("deploy.yaml"), None)
+    assert contract.joint_names == (*LEGS, "FR_foot_joint", "FL_foot_joint", "RR_foot_joint", "RL_foot_joint")
+    assert set(contract.velocity_joints) == set(WHEELS) and contract.action_scale == (0.25,) * 12 + (5.0,) * 4
+    assert contract.stiffness == (20.0,) * 12 + (0.0,) * 4 and contract.damping == (0.5,) * 16
+    assert contract.default_joint_position[12:] == (0.0,) * 4
+    assert contract.provenance["assumed"] == (
+        "robot 'go2w', the one with wheels that is installed; "
+        "gains of the wheels of robot 'go2w', because its lists hold 12 joints"
+    )
+    with pytest.raises(PolicyError, match="as wheels are, and robot 'go2' takes targets of angle alone"):
+        read_deploy(settings, Path("deploy.yaml"), GO2)
+    settings["actions"]["JointVelocityAction"]["joint_ids"] = [12, 13, 14]
+    with pytest.raises(PolicyError, match=r"every number from 0 to 15 is needed once for robot 'go2w'"):
+        read_deploy(settings, Path("deploy.yaml"), GO2W)
+
+
 def settings_of_rl_sar(folder):
     numbered = [*LEGS[3:6], *LEGS[:3], *LEGS[9:], *LEGS[6:9], WHEELS[1], WHEELS[0], WHEELS[3], WHEELS[2]]
     base = {"dt": 0.005, "decimation": 4, "joint_names": numbered, "joint_mapping": list(range(16))}
