@@ -4,13 +4,15 @@
     python benchmarks/remaining_time.py --replay timelines
 
 A command runs with a terminal of its own, or with ``--pipe`` with a pipe; every remaining time that it shows is noted with the time
-at which it is shown. Printed are, for each command, the error of the remaining time at each tenth of the command's duration (shown
-over true, less one), and the longest time without anything new on the terminal.
+at which it is shown. With ``--runs 2`` it runs once more, when it remembers the time of its first run. Printed are, for each command,
+the error of the remaining time at each tenth of the command's duration (shown over true, less one), and the longest time without
+anything new on the terminal.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import os
 import pty
@@ -20,7 +22,8 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from importlib.metadata import version
 from pathlib import Path
 
 COMMANDS = {
@@ -39,8 +42,13 @@ _LEFT = re.compile(r"about (?:(\d+) h )?(?:(\d+) min ?)?(?:(\d+) s)? ?left")
 _CODES = re.compile(rb"\x1b\[[0-9;?]*[A-Za-z]")
 
 
-def record(arguments: Sequence[str], *, pipe: bool = False) -> dict[str, object]:
+def record(
+    arguments: Sequence[str], *, pipe: bool = False, environment: Mapping[str, str] | None = None
+) -> dict[str, object]:
     """Run a command line of ``gaitgauge`` on a terminal, or into a ``pipe``; return its timeline.
+
+    Args:
+        environment: further variables of the command.
 
     Returns:
         ``seconds``: the command's duration; ``shown``: pairs of a time and the remaining time shown at it, both in seconds;
@@ -48,14 +56,13 @@ def record(arguments: Sequence[str], *, pipe: bool = False) -> dict[str, object]
         ``last``: the last text.
     """
     ours, theirs = os.pipe() if pipe else pty.openpty()
-    environment = os.environ | {"COLUMNS": "200", "TERM": "xterm"}
     began = time.monotonic()
     process = subprocess.Popen(
         [sys.executable, "-m", "gaitgauge.cli.main", *arguments],
         stdin=subprocess.DEVNULL,
         stdout=theirs,
         stderr=theirs,
-        env=environment,
+        env={**os.environ, "COLUMNS": "200", "TERM": "xterm", **(environment or {})},
     )
     os.close(theirs)
     shown: list[tuple[float, float]] = []
@@ -129,20 +136,31 @@ def main() -> None:
         "--with", dest="files", action="append", default=[], metavar="NAME=FILE", help="a file for {NAME}"
     )
     parser.add_argument("--also", default="", help="further options of the commands")
+    parser.add_argument(
+        "--runs", type=int, default=1, help="of each command; each remembers the time of the one before"
+    )
     parser.add_argument("--pipe", action="store_true", help="give commands a pipe in place of a terminal")
     options = parser.parse_args()
     timelines: dict[str, dict[str, object]] = {}
     if options.replay:
         timelines = {path.stem: json.loads(path.read_text()) for path in sorted(options.replay.glob("*.json"))}
     files = dict(pair.partition("=")[::2] for pair in options.files)
-    for name in options.commands:
+    memory = tempfile.TemporaryDirectory()
+    kernels = Path(os.environ.get("WARP_CACHE_PATH") or Path.home() / ".cache" / "warp" / version("warp-lang"))
+    for name, run in itertools.product(options.commands, range(1, options.runs + 1)):
         with tempfile.TemporaryDirectory() as folder:
             line = COMMANDS[name].format_map(files) + f" {options.also} --out {folder}/out"
-            timelines[name] = record(shlex.split(line), pipe=options.pipe)
+            if run == 1:
+                memory.cleanup()
+                memory = tempfile.TemporaryDirectory()
+            environment = {"XDG_CACHE_HOME": memory.name, "WARP_CACHE_PATH": str(kernels)}
+            label = name if run == 1 else f"{name}-{run}"
+            timelines[label] = record(shlex.split(line), pipe=options.pipe, environment=environment)
         if options.out:
             options.out.mkdir(parents=True, exist_ok=True)
-            (options.out / f"{name}.json").write_text(json.dumps(timelines[name]) + "\n")
-        print(table({name: timelines[name]}), flush=True)
+            (options.out / f"{label}.json").write_text(json.dumps(timelines[label]) + "\n")
+        print(table({label: timelines[label]}), flush=True)
+    memory.cleanup()
     if len(timelines) > 1 or options.replay:
         print(table(timelines))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -15,6 +16,7 @@ from rich.table import Table
 from rich.text import Text
 
 from .console import Terminal, printable
+from .remembered import Remembered, folder_of_times
 
 _LOG_EVERY = 8.0
 """Time between two lines where there is no terminal [s]."""
@@ -44,6 +46,7 @@ class ProgressDisplay:
         """Time from the command's beginning to that of its work [s]: Python and the packages are loaded in it."""
         self.closing = 0.0
         """Time that follows the work of which ``update`` tells the rest [s]."""
+        self._memory = Remembered((), None)
         self._details: Mapping[str, str] = {}
         self._live: Live | None = None
         self._lock, self._stop = threading.Lock(), threading.Event()
@@ -52,10 +55,11 @@ class ProgressDisplay:
     def __enter__(self) -> ProgressDisplay:
         first, ProgressDisplay._first = self._first, None
         if first is not None:
-            self._began, self._told = first._began, first._told
+            self._began, self._told, self._memory = first._began, first._told, first._memory
             self.start = self._clock() - self._began
             self.closing = _CLOSING * self.start
             first.close()
+            self._expect(0.0, None)
         self._open()
         return self
 
@@ -86,11 +90,17 @@ class ProgressDisplay:
     @classmethod
     @contextmanager
     def of_start(cls, console: Terminal, title: str, *, clock: Callable[[], float] = time.monotonic) -> Iterator[None]:
-        """Show that a command reads files and imports packages, until it shows its own progress."""
+        """Show that a command reads files and imports packages, until it shows its own progress.
+
+        What the command's time was is remembered at its end, unless an error ended it.
+        """
         ProgressDisplay._first = first = cls(console, title, clock=clock)
+        first._memory = memory = Remembered(sys.argv[1:], folder_of_times())
+        first._expect(0.0, None)
         first._open(transient=True)
         try:
             yield
+            memory.keep(clock() - first._began)
         finally:
             ProgressDisplay._first = None
             first.close()
@@ -112,10 +122,15 @@ class ProgressDisplay:
             last: print a line in any case where there is no terminal.
         """
         with self._lock:
-            self._share, self._text, self._details = share, text, details or {}
-            self._left, self._updated = None if left is None else left + self.closing, self._clock()
+            self._text, self._details = text, details or {}
+            self._expect(share, None if left is None else left + self.closing)
         if self._live is None:
             self._tell(last=last)
+
+    def _expect(self, share: float, estimate: float | None) -> None:
+        """Take the share that is done, and the estimated rest with all that follows [s]."""
+        self._share, self._updated = share, self._clock()
+        self._left = self._memory.left(self._updated - self._began, share, estimate)
 
     def _tell(self, *, last: bool = False) -> None:
         """Print a line, if the last one was long enough ago, or if it is the ``last`` one."""

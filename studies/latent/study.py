@@ -33,8 +33,8 @@ from .separation import Separation, principal_components, separation
 
 PAIRS = {"terrains": "forward on every terrain", "commands": "every command on all terrains"}
 """Classes of the two figures, as in the paper."""
-_WALKING = 0.85
-"""Share of the time of a policy in which it walks; then its latents are told apart."""
+_WALKING = 0.8
+"""Share of the time of a policy in which it walks; then its latents are told apart and drawn."""
 STRIDES = 10
 """Notes that a mean is taken over: a second, in which a robot takes two to three strides."""
 

@@ -24,6 +24,12 @@ def no_films(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("gaitgauge.cli.clip.FilmTime._find", lambda self: None)
 
 
+@pytest.fixture(autouse=True)
+def no_remembered_times(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Times of command lines stay out of the user's cache."""
+    monkeypatch.setattr("gaitgauge.cli.progress.folder_of_times", lambda: tmp_path / "times")
+
+
 @pytest.fixture
 def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Result]:
     """Runs a command line in an empty folder."""
