@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import atexit
 import io
+import os
 import sys
 from typing import Annotated
 
@@ -47,7 +49,24 @@ def main() -> None:
             stream.reconfigure(errors="backslashreplace")  # where the terminal lacks a letter
     with output_failures():
         check_folder()
-        app(args=[_kebab(a) for a in sys.argv[1:]])
+        try:
+            app(args=[_kebab(a) for a in sys.argv[1:]])
+        except SystemExit as end:
+            _leave_gpu(end.code)
+            raise
+
+
+def _leave_gpu(code: int | str | None) -> None:
+    """End the process at once if its command failed with a GPU in use: the interpreter would give tens of gigabytes back array by array, or
+    wait for the lost process of a run.
+    """
+    torch = sys.modules.get("torch")
+    if not isinstance(code, int) or not code or torch is None or not torch.cuda.is_initialized():
+        return
+    atexit._run_exitfuncs()  # removes temporary folders
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)
 
 
 def _kebab(argument: str) -> str:
