@@ -93,6 +93,8 @@ class MujocoBackend(PhysicsBackend):
         self._strength, self._speed = (np.ones((n, joints)) for _ in range(2))
         self._read_gains(range(n))
         self._warned = np.zeros((n, 2), dtype=np.int64)
+        self._beyond = np.zeros(n, dtype=bool)
+        """Worlds in which a motor was beyond its limit by speed in their last step."""
         self._live = {
             "time": self._time,
             "qpos": self._qpos,
@@ -205,11 +207,9 @@ class MujocoBackend(PhysicsBackend):
             np.copyto(control, (held + offset)[:, None], where=waits[..., None])
         if some_limp and waits is None:
             waits = np.full((n, total), joint_targets is None)
-        if self._limits.by_speed:
+        if self._limits.by_speed or (some_limp and waits is not None):
             loose = np.zeros((n, total), dtype=bool) if waits is None else waits & self._limp[those, None]
-            records = self._play_singly(rows, control, loose)
-        elif some_limp and waits is not None:
-            records = self._play_some_limp(rows, control, self._limp[those], waits)
+            records = self._play_following(rows, control, loose)
         else:
             self._play(rows, control, records)
         if joint_targets is not None:  # a target that waits for the whole step acts from the next one on
@@ -255,18 +255,39 @@ class MujocoBackend(PhysicsBackend):
         self._batch.rollout(control.shape[1], control, ids=self._ids(rows), record=RECORDED, out=records)
         self.engine_seconds += perf_counter() - began
 
-    def _play_some_limp(
-        self, rows: NDArray[np.int64], control: Array, limp: NDArray[np.bool_], waits: NDArray[np.bool_]
-    ) -> Records:
-        """Step worlds as ``_play`` does, with ``limp`` motors, (rows,), while their target ``waits``, (rows, substeps)."""
-        others, some = rows[~limp], control[~limp]
-        loose = self._play_singly(rows[limp], control[limp], waits[limp])
-        records = self._memory(len(others), control.shape[1])[1]
-        if len(others):
-            self._play(others, some, records)
-        merged = {name: np.empty((len(limp), *array.shape[1:])) for name, array in loose.items()}
+    def _play_following(self, rows: NDArray[np.int64], control: Array, loose: NDArray[np.bool_]) -> Records:
+        """Step worlds as ``_play`` does, where targets may have to follow the state, and return the records.
+
+        The targets of ``loose`` motors, (rows, substeps), follow it, and those of motors beyond a limit by speed. Whether a world
+        had one of those shows afterwards: it goes back and is played singly, as is its next step, since they come in rows.
+        The results are those of playing all worlds singly, which takes several times as long.
+        """
+        singly = loose.any(axis=1) | self._beyond[rows]
+        some = np.flatnonzero(~singly)
+        worlds, asked = rows[some], control[some]
+        records = self._memory(len(some), control.shape[1])[1]
+        if len(some):
+            state, warned = self._batch.state[worlds], self._warning_counts(worlds)
+            position, velocity = (array[worlds][:, None] for array in (self._qpos, self._qvel))
+            self._play(worlds, asked, records)
+            if self._limits.by_speed:
+                position, velocity = (
+                    np.concatenate([first, records[name][:, :-1]], axis=1)[:, :, columns]
+                    for first, name, columns in ((position, "qpos", self._joint_q), (velocity, "qvel", self._joint_v))
+                )
+                _, beyond = self._follow(worlds[:, None], asked, position, velocity)
+                again = self._beyond[worlds] = beyond.any(axis=(1, 2))
+                back = worlds[again]
+                self._batch.state[back] = state[again]
+                self._warned[back] += self._warning_counts(back) - warned[again]
+                singly[some[again]] = True
+        if not singly.any():
+            return records
+        merged = {name: np.empty((len(rows), *array.shape[1:])) for name, array in records.items()}
         for name, array in merged.items():
-            array[limp], array[~limp] = loose[name], records[name]
+            array[some] = records[name]
+        for name, array in self._play_singly(rows[singly], control[singly], loose[singly]).items():
+            merged[name][singly] = array
         return merged
 
     def _play_singly(self, rows: NDArray[np.int64], control: Array, loose: NDArray[np.bool_]) -> Records:
@@ -274,24 +295,36 @@ class MujocoBackend(PhysicsBackend):
 
         ``loose`` motors, (rows, substeps), get a target with zero torque; motors beyond a limit by speed get the limit's target.
         """
-        parts = []
+        parts, beyond = [], np.zeros(len(rows), dtype=bool)
         for substep in range(control.shape[1]):
             position, velocity = self._qpos[np.ix_(rows, self._joint_q)], self._qvel[np.ix_(rows, self._joint_v)]
-            turned = np.where(self._by_velocity, 0.0, position)
-            free = 0.0 if self._direct else turned + self._kd_over_kp[rows] * velocity
-            target = control[:, substep]
-            if self._limits.by_speed:
-                gain, strength = self._gain[rows], self._strength[rows]
-                asked = gain * (target - free)
-                lower, upper = self._limits.bounds(velocity / self._speed[rows])
-                given = asked.clip(lower * strength, upper * strength)
-                cut = (given != asked) & (gain > 0.0)
-                target = np.where(cut, free + np.divide(given, gain, out=np.zeros_like(gain), where=cut), target)
+            target, cut = self._follow(rows, control[:, substep], position, velocity)
+            beyond |= cut.any(axis=1)
             now, records = self._memory(len(rows), 1)
-            now[:] = np.where(loose[:, substep, None], free, target)[:, None]
+            now[:] = np.where(loose[:, substep, None], self._free(rows, position, velocity), target)[:, None]
             self._play(rows, now, records)
             parts.append({name: array.copy() for name, array in records.items()})
+        self._beyond[rows] = beyond
         return {name: np.concatenate([p[name] for p in parts], axis=1) for name in RECORDED}
+
+    def _free(self, rows: NDArray[np.int64], position: Array, velocity: Array) -> Array | float:
+        """Return the target without torque, (…, J), at joint positions and velocities of that shape."""
+        return 0.0 if self._direct else np.where(self._by_velocity, 0.0, position) + self._kd_over_kp[rows] * velocity
+
+    def _follow(
+        self, rows: NDArray[np.int64], target: Array, position: Array, velocity: Array
+    ) -> tuple[Array, NDArray[np.bool_]]:
+        """Return the targets, (…, J), of which motors give no more than their limits by speed allow, and which were beyond."""
+        if not self._limits.by_speed:
+            return target, np.zeros(target.shape, dtype=bool)
+        free, gain, strength = self._free(rows, position, velocity), self._gain[rows], self._strength[rows]
+        asked = gain * (target - free)
+        lower, upper = self._limits.bounds(velocity / self._speed[rows])
+        given = asked.clip(lower * strength, upper * strength)
+        cut = (given != asked) & (gain > 0.0)
+        if not cut.any():
+            return target, cut
+        return np.where(cut, free + np.divide(given, gain, out=np.zeros_like(given), where=cut), target), cut
 
     def _watch(self, those: slice | NDArray[np.int64], records: Records) -> bool:
         """Record the first substep beyond each watched limit, and return whether there was any."""

@@ -73,6 +73,27 @@ def test_a_world_moves_alike_in_any_company(scene: Scene, substeps: int | None, 
     assert tilted
 
 
+def test_limits_by_speed_act_in_a_whole_step_as_in_its_substeps(scene: Scene):
+    """A step is played in one call, and again where a motor was beyond its limit; ten steps of one substep leave no choice."""
+    physics = PhysicsOptions(torque_limits=True, torque_speed_limit=True, watch_tilt=1e-3)
+    whole, parts = (MujocoBackend(replace(scene, physics=physics)) for _ in range(2))
+    pose = torch.tensor(scene.robot.default_joint_position, dtype=torch.float64).repeat(WORLDS, 1)
+    for backend in (whole, parts):
+        start(scene, pose, None, backend)
+    generator = torch.Generator().manual_seed(3)
+    beyond = torch.zeros(WORLDS, dtype=torch.int64)
+    for step in range(8):
+        scale = torch.tensor([0.0, 0.05, 1.0, 3.0 if step % 3 else 0.0, 3.0], dtype=torch.float64)
+        targets = pose + scale[:, None] * torch.randn(WORLDS, 12, generator=generator, dtype=torch.float64)
+        whole.step(targets)
+        for _ in range(10):
+            parts.step(targets, substeps=1)
+        for name in ("base_position_w", "joint_position", "joint_velocity", "joint_torque", "foot_contact_force_w"):
+            assert torch.equal(getattr(whole.state, name), getattr(parts.state, name)), f"{name} after step {step}"
+        beyond += torch.from_numpy(whole._beyond)
+    assert beyond[0] == 0 and 0 < beyond[3] < 8 and beyond[4] > 0
+
+
 @pytest.mark.parametrize("cause", ["tilt", "penetration", "target"])
 def test_a_step_is_eventful_exactly_where_a_flag_is_set(scene: Scene, cause: str):
     physics = PhysicsOptions(watch_tilt=0.5, watch_penetration=0.01)
