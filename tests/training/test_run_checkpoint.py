@@ -111,6 +111,13 @@ def test_run_directories(tmp_path):
     assert find_checkpoint("latest", experiment="go2", task="own:TASK", root=tmp_path) == own / "model_4.pt"
     assert find_checkpoint("latest", experiment="go2", root=tmp_path) == own / "model_4.pt"
     assert find_checkpoint(str(first), experiment="other", root=tmp_path) == first / "model_1000.pt"
+    run = tmp_path / "killed"
+    run.mkdir()
+    with pytest.raises(CheckpointError, match=r"killed' has no model_<iteration>\.pt\.$"):
+        find_checkpoint(str(run), experiment="rough")
+    (run / "run.json").write_text("{}")
+    with pytest.raises(CheckpointError, match=r"\.pt; the run ended before its first one .*: start it again\.$"):
+        find_checkpoint(str(run), experiment="rough")
     with pytest.raises(CheckpointError, match=r"There is no checkpoint 'none\.pt'"):
         find_checkpoint("none.pt", experiment="go2", root=tmp_path)
 

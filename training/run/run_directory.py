@@ -78,7 +78,11 @@ def find_checkpoint(
     if path.is_dir():
         if found := latest_checkpoint(path):
             return found
-        raise CheckpointError(f"There is no checkpoint: '{one_line(choice)}' has no model_<iteration>.pt.")
+        ended = "; the run ended before its first one (training.run.save_interval): start it again"
+        raise CheckpointError(
+            f"There is no checkpoint: '{one_line(choice)}' has no model_<iteration>.pt"
+            f"{ended if (path / 'run.json').is_file() else ''}."
+        )
     if not path.is_file():
         known = ", ".join(["latest", *others, "a run directory"])
         raise CheckpointError(f"There is no checkpoint '{one_line(choice)}'; give {known} or a model_<iteration>.pt.")
