@@ -19,6 +19,8 @@ MOST_BAD = 0.2
 """Largest share of rows that may be dropped; beyond it a log is refused."""
 LONGEST_GAP = 0.5
 """Longest time without a row [s]."""
+_MOVING = 0.2
+"""RMS velocity [rad/s] from which a joint's recorded velocities are held against its positions."""
 _SPIKE = 0.25
 """Distance of a position from the middle of its two neighbours that no joint covers between three rows [rad]."""
 _BEYOND = 0.5
@@ -155,6 +157,7 @@ def make_log(name: str, robot: Robot, columns: Mapping[str, Any], *, notes: Sequ
         notes=tuple(notes),
     )
     _check_joints(log, source)
+    _check_velocity(log, source)
     return log
 
 
@@ -224,6 +227,31 @@ def _check_joints(log: Log, source: str) -> None:
             )
 
 
+def _check_velocity(log: Log, source: str) -> None:
+    """Refuse velocities that are not the change of their positions: degrees, a wrong sign, columns under the wrong name."""
+    if log.velocity is None:
+        return
+    every = max(round(0.02 / log.period), 1)
+    time, position = log.time[::every], log.position[::every]
+    area = np.zeros_like(log.velocity)
+    np.cumsum((log.velocity[1:] + log.velocity[:-1]) / 2 * np.diff(log.time)[:, None], axis=0, out=area[1:])
+    moved, said = np.diff(position, axis=0), np.diff(area[::every], axis=0)
+    power = (moved**2).mean(axis=0)
+    share = (moved * said).mean(axis=0) / power.clip(1e-12)
+    moving = power > (_MOVING * np.median(np.diff(time))) ** 2
+    wrong = np.flatnonzero(moving & ~((share > 0.5) & (share < 1.6)))
+    if len(wrong):
+        j = int(wrong[0])
+        hint = (
+            "they look like degrees and must be rad/s"
+            if 30.0 < abs(share[j]) < 90.0
+            else ("their sign or their column is wrong (signs in --map)" if share[j] < 0.5 else "they must be rad/s")
+        )
+        raise LogError(
+            f"{source}: velocities of {log.robot.joint_names[j]} are {share[j]:.2g} times the change of its positions; {hint}"
+        )
+
+
 def joint_ranges(robot: Robot) -> Array:
     """Return the lower and upper limit of each joint [rad], (J, 2); infinite where the model has none."""
     import mujoco
@@ -233,13 +261,28 @@ def joint_ranges(robot: Robot) -> Array:
     return np.array([joint.range if model.jnt_limited[joint.id] else (-np.inf, np.inf) for joint in joints])
 
 
-def inverse_torque(robot: Robot, position: Array) -> Array:
-    """Return the torque with which each joint of free legs under an upright, fixed trunk rests at a pose [N·m], (J,)."""
+def free_legs_torque(
+    robot: Robot, position: Array, velocity: Array | None = None, acceleration: Array | None = None
+) -> Array:
+    """Return the torque that moves or holds free legs under an upright, fixed trunk, without rotors and friction [N·m], (T, J).
+
+    Args:
+        position: of the joints [rad], (T, J).
+        velocity, acceleration: [rad/s, rad/s²], (T, J); None for legs at rest.
+    """
     import mujoco
 
-    model, data = _posed(robot, position)
-    mujoco.mj_inverse(model, data)
-    return np.array([data.qfrc_inverse[model.joint(joint).dofadr[0]] for joint in robot.joint_names])
+    model, data = _posed(robot, position[0])
+    places = [int(model.joint(joint).qposadr[0]) for joint in robot.joint_names]
+    columns = [int(model.joint(joint).dofadr[0]) for joint in robot.joint_names]
+    found = np.empty_like(position)
+    for row in range(len(position)):
+        data.qpos[places] = position[row]
+        data.qvel[columns] = 0.0 if velocity is None else velocity[row]
+        data.qacc[columns] = 0.0 if acceleration is None else acceleration[row]
+        mujoco.mj_inverse(model, data)
+        found[row] = data.qfrc_inverse[columns]
+    return found
 
 
 def carried_share(robot: Robot, position: Array, torque: Array) -> float:
@@ -266,11 +309,11 @@ def carried_share(robot: Robot, position: Array, torque: Array) -> float:
 
 
 def _posed(robot: Robot, position: Array) -> tuple[Any, Any]:
-    """Return a robot's model without contacts and friction, and its data at a pose."""
+    """Return a robot's model without contacts, friction and rotors, and its data at a pose."""
     import mujoco
 
     model = mujoco.MjModel.from_xml_path(str(robot.mjcf))
-    model.dof_frictionloss[:] = 0.0
+    model.dof_frictionloss[:] = model.dof_damping[:] = model.dof_armature[:] = 0.0
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT.value
     data = mujoco.MjData(model)
     for joint, angle in zip(robot.joint_names, position, strict=True):

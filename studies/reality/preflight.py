@@ -16,9 +16,10 @@ from ...policy.contract import PolicyContract, check_robot
 from ...policy.loading import load_policy, own_contract
 from ...policy.robot_of import robot_for
 from ...robots import Robot
+from .acting_delay import acting_delay
 from .log import Array, Log, LogError
 from .page import render_preflight
-from .replaying import fit_delay, read_logs
+from .replaying import read_logs
 from .request import PreflightRequest
 from .rig import FixedRig, acting_parameters, at_rows, beginning, held_targets, num_steps
 
@@ -86,7 +87,7 @@ def checks(log: Log, contract: PolicyContract) -> Iterator[Finding]:
     yield _pose(log, contract, order)
     yield _upright(log)
     yield _gyroscope(log)
-    yield from _motors(log)
+    yield from _motors(log, contract)
 
 
 def _finding(check: str, wrong: str, fine: str, *, told: bool = True) -> Finding:
@@ -264,20 +265,23 @@ def _agree(shares: Array) -> bool:
     return bool(((shares > 0.5) & (shares < 1.5)).all())
 
 
-def _motors(log: Log) -> Iterator[Finding]:
-    """Compare delay and offsets with the nominal robot hung by its trunk."""
+def _motors(log: Log, contract: PolicyContract) -> Iterator[Finding]:
+    """Compare the delay with the control period, and positions with those of the nominal robot hung by its trunk."""
+    delay, most = acting_delay(log), contract.control_period
+    wrong = ""
+    if delay is not None and delay > most:
+        wrong = f"targets act after {1e3 * delay:.0f} ms, longer than the control period of {1e3 * most:g} ms"
+    words = "motions up to 5 Hz of a robot that hangs tell it, or torques in rows of 5 ms and less"
+    fine = words if delay is None else f"targets act after {1e3 * delay:.0f} ms"
+    yield _finding("delay", wrong, fine, told=delay is not None)
     if log.held != "hung":
-        yield _finding("delay and offsets", "", "they take a log of a robot that hangs (held)", told=False)
+        yield _finding("offsets", "", "they take a log of a robot that hangs (held)", told=False)
         return
     nominal = log.robot.parameters[log.robot.default_parameters]
-    delay = fit_delay(log, nominal, threads=1)
-    wrong = f"targets act after {1e3 * delay:.1f} ms, longer than a control period of 20 ms" if delay > 0.02 else ""
-    yield _finding("delay", wrong, f"targets act after {1e3 * delay:.1f} ms")
     rig = FixedRig(log.robot, nominal, threads=1)
     try:
-        series = rig.run(
-            [acting_parameters(log, nominal)], held_targets(log, delay, num_steps(log))[None], [beginning(log)]
-        )
+        targets = held_targets(log, delay or 0.0, num_steps(log))
+        series = rig.run([acting_parameters(log, nominal)], targets[None], [beginning(log)])
     finally:
         rig.close()
     offset = np.median(log.position - at_rows(log, series[0, 0]), axis=0)

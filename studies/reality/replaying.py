@@ -18,7 +18,7 @@ from ...gauge.play.remaining import Stage
 from ...robots import JointParameters
 from ...robots.sets import find_set, joint_groups
 from ..turns import Turns, Watch
-from .log import Log, LogError, carried_share, inverse_torque
+from .log import Log, LogError, carried_share, free_legs_torque
 from .page import render_page, traces
 from .readers import read_log, read_map
 from .request import LogOptions, ReplayRequest
@@ -72,7 +72,7 @@ def _check_hung(log: Log) -> None:
         )
     pose, error = np.median(log.position, axis=0), log.target - log.position
     speed = log.velocity if log.velocity is not None else np.gradient(log.position, log.time, axis=0)
-    free = inverse_torque(log.robot, pose)
+    free = free_legs_torque(log.robot, pose[None])[0]
     carried = carried_share(log.robot, pose, (log.stiffness * error - log.damping * speed).mean(axis=0) - free)
     if carried > _CARRIED:
         raise LogError(
@@ -172,7 +172,9 @@ def check_torque(log: Log) -> None:
     """
     if log.torque is None:
         return
-    shares = []
+    if not log.torque.any():
+        raise LogError(f"log '{log.name}' has torques of 0 in every row; leave them out, or record the motors' own")
+    slopes = []
     speed = log.velocity if log.velocity is not None else np.gradient(log.position, log.time, axis=0)
     for lag in range(8):
         rows = slice(lag, None), slice(None, len(log.time) - lag)
@@ -181,13 +183,12 @@ def check_torque(log: Log) -> None:
         for j in range(log.target.shape[1]):
             columns = np.stack([error[:, j], -speed[rows[0]][:, j], np.ones(len(error))], axis=1)
             solution, residual, *_ = np.linalg.lstsq(columns, log.torque[rows[0]][:, j], rcond=None)
-            found.append((float(residual[0]) if len(residual) else np.inf, solution[0] / max(log.stiffness[j], 1e-9)))
-        shares.append((sum(r for r, _ in found), float(np.median([s for _, s in found]))))
-    share = min(shares)[1]
-    if not 0.5 <= share <= 1.6:
-        kp = float(np.median(log.stiffness))
+            found.append((float(residual[0]) if len(residual) else np.inf, solution[0]))
+        slopes.append((sum(r for r, _ in found), [float(s) for _, s in found]))
+    followed = np.array(min(slopes)[1])
+    if not 0.5 <= float(np.median(followed / log.stiffness.clip(1e-9))) <= 1.6:
         raise LogError(
-            f"log '{log.name}' says that kp was {kp:g} N·m/rad, but its torques follow {share * kp:.3g}; "
+            f"log '{log.name}' says that kp was {np.median(log.stiffness):g} N·m/rad, but its torques follow {np.median(followed):.3g}; "
             "correct the gains (stiffness and damping in --map)"
         )
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from gaitgauge.policy.loading import load_policy
 from gaitgauge.robots import load_robot
+from gaitgauge.studies.reality.acting_delay import acting_delay
 from gaitgauge.studies.reality.chirp import Chirp, simulated_log
 from gaitgauge.studies.reality.log import LogError, save_log
 from gaitgauge.studies.reality.preflight import checks, preflight
@@ -87,6 +88,18 @@ def test_each_mistake_is_named(log, contract):
     swapped = replace(log, angular_velocity=log.angular_velocity[:, [1, 0, 2]])
     assert "frame is not the base's" in wrong(swapped, contract)["gyroscope"]
     assert "wrong sign" in wrong(replace(log, angular_velocity=-log.angular_velocity), contract)["gyroscope"]
+
+
+@pytest.mark.parametrize(
+    ("rate", "torque", "last", "told"),
+    [(500.0, True, 2.0, True), (500.0, False, 5.0, True), (50.0, True, 5.0, True), (500.0, False, 1.0, False)],
+)
+def test_the_delay_needs_no_guess_of_rotors_and_friction(rate, torque, last, told):
+    truth = replace(GO2.parameters["gauge"], armature=(0.03,) * 12, friction_loss=(0.4,) * 12, delay=0.012)
+    made = simulated_log(GO2, truth, chirp=Chirp(seconds=4.0, last=last, rate=rate), stiffness=20.0, damping=0.5)
+    delay = acting_delay(made if torque else replace(made, torque=None))
+    assert (delay is not None) == told
+    assert delay is None or abs(delay - 0.012) <= 0.002
 
 
 def test_targets_change_at_the_control_period(log, contract):

@@ -10,7 +10,7 @@ from gaitgauge.backends.base import PhysicsOptions, Scene
 from gaitgauge.backends.registry import make_backend
 from gaitgauge.robots import load_robot
 from gaitgauge.studies.reality.chirp import Chirp, simulated_log
-from gaitgauge.studies.reality.log import LogError, carried_share, inverse_torque, save_log
+from gaitgauge.studies.reality.log import LogError, carried_share, free_legs_torque, save_log
 from gaitgauge.studies.reality.readers import LogMap, read_log, read_map
 from gaitgauge.studies.reality.replaying import check_torque, hung_or_standing
 from gaitgauge.terrains.registry import make_terrain
@@ -170,6 +170,11 @@ def test_bad_rows_are_counted_and_handled(log, tmp_path):
         ),
         (lambda c: c | {"position": np.full_like(c["position"], np.nan)}, "values that are missing"),
         (lambda c: c | {k: np.rad2deg(c[k]) for k in ("position", "target")}, "look like degrees"),
+        (
+            lambda c: c | {"velocity": np.rad2deg(c["velocity"])},
+            "velocities of FL_hip_joint are 5. times .* look like degrees",
+        ),
+        (lambda c: c | {"velocity": -c["velocity"]}, "their sign or their column is wrong"),
         (lambda c: c | {"joint_names": np.roll(c["joint_names"], 1)}, "outside of its range"),
         (lambda c: c | {"joint_names": np.array(["LF_HAA"] * 12)}, "is not of robot 'go2'"),
         (lambda c: {k: v for k, v in c.items() if k != "target"}, "lacks target"),
@@ -225,7 +230,7 @@ def test_legs_of_a_standing_robot_carry_its_weight():
     for _ in range(75):
         engine.step(torch.tensor([robot.default_joint_position], dtype=engine.dtype))
     position, torque = engine.state.joint_position[0].numpy(), engine.state.joint_torque[0].numpy()
-    share = carried_share(robot, position, torque - inverse_torque(robot, position))
+    share = carried_share(robot, position, torque - free_legs_torque(robot, position[None])[0])
     assert share == pytest.approx(1.0, abs=0.1)
     assert abs(carried_share(robot, position, np.zeros(12))) < 1e-9
 
@@ -234,3 +239,7 @@ def test_gains_that_the_torques_contradict_are_refused(log):
     check_torque(log)
     with pytest.raises(LogError, match=r"says that kp was 60 N·m/rad, but its torques follow 2\d"):
         check_torque(replace(log, stiffness=np.full(12, 60.0)))
+    with pytest.raises(LogError, match="kp was 0 N·m/rad, but its torques follow 2"):
+        check_torque(replace(log, stiffness=np.zeros(12)))
+    with pytest.raises(LogError, match="torques of 0 in every row"):
+        check_torque(replace(log, torque=np.zeros_like(log.torque)))
