@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import fields, replace
+from itertools import pairwise
 
 import pytest
 import torch
@@ -282,6 +283,25 @@ def test_torsion_of_the_feet_is_at_its_ends_in_a_share_of_the_worlds():
     )
 
 
+@pytest.mark.parametrize(
+    ("time", "shares"), [(0.0, [1.0] * 4), (0.05, [1.0 - math.exp(-0.4 * k) for k in (1, 2, 1, 2)])]
+)
+def test_the_error_of_a_turn_is_averaged_from_the_draw_of_its_command(time, shares):
+    stage = CommandStage(begin=0.0, forward=(0.0, 0.0), lateral=(0.0, 0.0), yaw=(1.0, 1.0))
+    turning = CommandConfiguration(
+        stages=(stage,), interval=0.04, dynamic=False, extreme_probability=0.0, straight_probability=0.0
+    )
+    rewards = RewardConfiguration(turn_error=-2.0, turn_error_time=time)
+    environment = make(script=gliding(yaw=0.4), commands=turning, rewards=rewards)
+    summed = environment.parts.memory.episode_rewards[:, environment.parts.rewards.names.index("turn_error")]
+    totals = [0.0]
+    for _ in shares:
+        idle(environment)
+        totals.append(float(summed[0]))
+    paid = [later - earlier for earlier, later in pairwise(totals)]
+    assert paid == pytest.approx([-2.0 * 0.02 * 0.6 * share for share in shares], rel=1e-5)
+
+
 def test_motors_that_nobody_varies_are_not_written(monkeypatch):
     """An engine that cannot vary them can be trained on."""
     written = set()
@@ -310,7 +330,7 @@ def test_motor_speeds_that_would_do_nothing_are_refused():
 def test_soft_limits_of_joint_speeds_are_a_share_of_the_motors_own():
     def limits(environment):
         parts = environment.parts
-        return parts.read(environment.backend.state, parts.memory, parts.action, parts.progress()).soft_speed
+        return parts.read(parts.inputs, parts.memory, parts.action, parts.progress()).soft_speed
 
     weights = RewardConfiguration(joint_speed_limits=-0.3, soft_speed_limit=0.8)
     assert limits(make(rewards=weights)).reshape(4, 3).unique().tolist() == pytest.approx([0.8 * 15.65, 0.8 * 30.0])

@@ -39,6 +39,7 @@ def quiet():
         base_quaternion_w=torch.tensor([[1.0, 0.0, 0.0, 0.0]] * 2),
         base_height=torch.full((2,), 0.38),
         command=torch.zeros(2, 3),
+        turn_error=torch.zeros(2),
         sigma=torch.full((2, 3), 0.25),
         joint_position=joints,
         joint_velocity=joints,
@@ -129,7 +130,7 @@ CASES = {
         1.0,
     ),
     "turn_error": (
-        {"command": one_world([0.0, 0.05, -1.0], 3), "base_angular_velocity_b": one_world([9.0, 9.0, -0.4], 3)},
+        {"command": one_world([0.0, 0.05, -1.0], 3), "turn_error": torch.tensor([-0.6, 9.0])},
         0.6,
         0.0,
     ),
@@ -258,17 +259,17 @@ def test_weights_follow_progress(quiet):
 
 
 @pytest.mark.parametrize(
-    ("command", "rate", "expected"),
+    ("command", "error", "expected"),
     [
-        ([0.0, 0.0, 1.0], 0.4, 0.6),
-        ([0.0, 0.0, 1.0], 1.6, 0.6),
-        ([0.0, 0.05, -2.0], 0.0, 1.0),
+        ([0.0, 0.0, 1.0], 0.6, 0.6),
+        ([0.0, 0.0, 1.0], -0.6, 0.6),
+        ([0.0, 0.05, -2.0], -2.0, 1.0),
         ([0.0, 0.0, 0.1], 0.5, 0.0),
-        ([0.5, 0.0, 1.0], 0.4, 0.0),
+        ([0.5, 0.0, 1.0], 0.6, 0.0),
     ],
 )
-def test_the_error_of_turns_on_the_spot_counts_alike_below_and_above(quiet, command, rate, expected):
-    turning = replace(quiet, command=one_world(command, 3), base_angular_velocity_b=one_world([0.0, 0.0, rate], 3))
+def test_the_error_of_turns_on_the_spot_counts_alike_below_and_above(quiet, command, error, expected):
+    turning = replace(quiet, command=one_world(command, 3), turn_error=torch.tensor([error, 0.0]))
     assert float(REWARD_TERMS["turn_error"](turning)[0]) == pytest.approx(expected)
 
 
@@ -288,7 +289,7 @@ def test_a_tile_pays_by_its_factors(quiet):
 def test_every_weight_names_a_term():
     assert {f.name for f in fields(RewardWeights)} - {"own"} == set(REWARD_TERMS)
     parts = [{f.name for f in fields(part)} for part in (RewardWeights, RewardShapes, RewardLimits)]
-    assert {f.name for f in fields(RewardConfiguration)} == set.union(*parts) and sum(map(len, parts)) == 50
+    assert {f.name for f in fields(RewardConfiguration)} == set.union(*parts) and sum(map(len, parts)) == 51
 
 
 @pytest.mark.parametrize(

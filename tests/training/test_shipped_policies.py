@@ -1,6 +1,7 @@
 """Policies that ship hold what plays; what training needs to go on from the Go2's lies beside it."""
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -17,6 +18,7 @@ from gaitgauge.training.run.checkpoint import (
 )
 from gaitgauge.training.run.plan import prepare
 from gaitgauge.training.run.request import TrainRequest
+from gaitgauge.training.tasks import find_task
 
 PLAYS = {"format", "version", "contract", "network", "state_dict", "checksum"}
 
@@ -38,8 +40,16 @@ def test_training_goes_on_from_the_go2_with_its_teacher_and_critic():
     assert training_part(PRETRAINED).stat().st_size < 6_000_000
 
 
-def planned(path: Path):
-    return prepare(TrainRequest(task="go2-moe-cts", init_from=str(path), backend="fake", device="cpu", score=False))
+def planned(path: Path, **settings):
+    request = TrainRequest(task="go2-moe-cts", init_from=str(path), backend="fake", device="cpu", score=False)
+    return prepare(replace(request, **settings))
+
+
+def test_going_on_takes_small_steps_but_for_the_parts_of_a_ramp_that_are_given():
+    assert planned(PRETRAINED).task.training.algorithm.desired_kl == 0.003
+    found = planned(PRETRAINED, overrides=("training.algorithm.desired_kl.start=0.008",)).task.training.algorithm
+    assert found.desired_kl == replace(find_task("go2-moe-cts").training.algorithm.desired_kl, start=0.008)
+    assert found.learning_rate == 0.0003
 
 
 def test_a_policy_without_teacher_and_critic_is_told_apart(tmp_path):

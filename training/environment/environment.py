@@ -413,8 +413,10 @@ class TrainingEnvironment(VecEnv):
         headings = heading(state["physics"]["base_quaternion_w"])
         older = {"commanded_heading": headings, "holds_heading": torch.zeros_like(parts.memory.holds_heading)}
         older["episode_steps"] = state["memory"]["episode_length"]
-        # and one from before gait clocks has none
-        older |= {name: getattr(parts.memory, name) for name in ("foot_air_time", "foot_contact_time", "clocks")}
+        # and one from before gait clocks and averages of the yaw rate has none
+        older |= {
+            name: getattr(parts.memory, name) for name in ("foot_air_time", "foot_contact_time", "clocks", "turn_error")
+        }
         restore({**older, **state["memory"]}, parts.memory.by_name())
         self._require_below(parts.memory.level, self.palette.num_levels, "level")
         self._require_below(parts.memory.terrain_index, len(self.palette.terrains), "terrain_index")

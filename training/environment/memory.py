@@ -17,6 +17,7 @@ EPISODE = (
     "commanded_farthest",
     "issued",
     "shortfall",
+    "turn_error",
     "action",
     "previous_action",
     "joint_velocity",
@@ -80,6 +81,8 @@ class EnvironmentMemory:
     """Sum of the linear commands issued in this episode [m/s], (N, 2)."""
     shortfall: torch.Tensor
     """Share of the commanded speed that is missing of late, an exponential average, (N,)."""
+    turn_error: torch.Tensor
+    """Commanded less actual yaw rate of late [rad/s], an exponential average since the command was drawn, (N,)."""
     action: torch.Tensor
     """Raw action of the last step, (N, A)."""
     previous_action: torch.Tensor
@@ -149,7 +152,7 @@ class EnvironmentMemory:
         numbers = partial(torch.zeros, device=device)
         counts = partial(numbers, dtype=torch.int64)
         flags = partial(numbers, num_envs, dtype=torch.bool)
-        widths = (None, 2, None, 2, None, actions, actions, joints, joints, joints, feet, feet, feet, terms, None)
+        widths = (None, 2, None, 2, None, None, actions, actions, joints, joints, joints, feet, feet, feet, terms, None)
         episode, columns = _block(numbers, num_envs, names=EPISODE, widths=widths)
         sums, totals = _block(numbers, names=SUMS, widths=(terms, None, ends, metrics, None))
         return cls(

@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from ...files.parsing import Positive, Share
+from ...files.parsing import NotNegative, Positive, Share
 from ..configuration import Ramp, Range, check_rising
 
 Extent = Annotated[float, Field(ge=0.0, le=10.0)]
@@ -150,6 +150,9 @@ class RewardShapes:
     """Let sigma grow with command and terrain level (paper, dynamic velocity tracking precision adjustment)."""
     sigma_linear_range: Range = (0.5, 1.5)
     """Commanded speed between which sigma grows to the terrain's largest [m/s]."""
+    turn_error_time: NotNegative = 0.0
+    """Time over which ``turn_error`` averages the error, exponentially [s]; 0 for that of each step. Within a step of a gait the yaw rate
+    swings about its mean: the mean's own error then costs what the swing leaves of it."""
     sigma_yaw_range: Range = (1.0, 2.0)
     """Commanded yaw rate between which sigma grows to the terrain's largest [rad/s]."""
     progress_along: Literal["command", "straight", "base"] = "straight"

@@ -38,11 +38,11 @@ def yaw_tracking(inputs: StepInputs) -> torch.Tensor:
 
 
 def turn_error(inputs: StepInputs) -> torch.Tensor:
-    """Absolute error of the yaw rate [rad/s], at most ``LARGEST_TURN_ERROR``; 0 but for turns on the spot of ``SLOWEST_TURN`` or more."""
-    yaw = inputs.command[:, 2]
-    turns = ~commanded_to_move(inputs.command) & (yaw.abs() >= SLOWEST_TURN)
-    error = (yaw - inputs.base_angular_velocity_b[:, 2]).abs().clamp(max=LARGEST_TURN_ERROR)
-    return torch.where(turns, error, 0.0)
+    """Absolute error of the yaw rate [rad/s], averaged over ``turn_error_time``, at most ``LARGEST_TURN_ERROR``; 0 but for turns on the
+    spot of ``SLOWEST_TURN`` or more.
+    """
+    turns = ~commanded_to_move(inputs.command) & (inputs.command[:, 2].abs() >= SLOWEST_TURN)
+    return torch.where(turns, inputs.turn_error.abs().clamp(max=LARGEST_TURN_ERROR), 0.0)
 
 
 def progress(inputs: StepInputs) -> torch.Tensor:

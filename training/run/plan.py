@@ -103,7 +103,11 @@ def run_with_weights(request: TrainRequest, choice: str) -> TrainPlan:
     # Schedules go on where the earlier training stopped, robots that can walk start on all levels, steps are smaller, and a policy
     # without its exploration noise gets little. Settings of the request come after these.
     highest = f"environment.terrain.highest_start_level={named.environment.terrain.levels - 1}"
-    task = _named_task(request, (f"environment.schedule.begin={reached(entries):g}", highest, *_SMALL_STEPS))
+    first = (f"environment.schedule.begin={reached(entries):g}", highest, *_SMALL_STEPS)
+    # A number in the place of a ramp would hide the parts that the request sets.
+    given = [override.lstrip() for override in request.own_overrides()]
+    kept = [s for s in first if not any(o.startswith(f"{s.partition('=')[0]}.") for o in given)]
+    task = _named_task(request, kept)
     notice = ""
     if "training" not in entries:
         notice = (
