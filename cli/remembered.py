@@ -20,6 +20,8 @@ from ..version import __version__
 
 _LEAST = 10.0
 """Time of a command that is worth remembering [s]."""
+_KEPT = 200
+"""Command lines of which the time is kept: the last ones."""
 _PARTS = 50
 """Parts of the work, by the share that is done."""
 _MOST = 3.0
@@ -85,6 +87,8 @@ class Remembered:
         with suppress(OSError):
             self._path.parent.mkdir(parents=True, exist_ok=True)
             write_atomically(self._path, json_text({"seconds": seconds, "factors": factors}), OSError)
+            for old in sorted(self._path.parent.glob("*.json"), key=lambda f: f.stat().st_mtime)[:-_KEPT]:
+                old.unlink(missing_ok=True)
 
 
 def _compiled_since(began: float) -> bool:

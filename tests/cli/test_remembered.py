@@ -52,6 +52,14 @@ def test_a_spoilt_memory_is_none(after, tmp_path, text):
     assert again(*LINE).left(20.0, 0.2, 40.0) == 40.0
 
 
+def test_the_last_lines_are_kept(after, tmp_path, monkeypatch):
+    monkeypatch.setattr("gaitgauge.cli.remembered._KEPT", 2)
+    for i, name in enumerate("abc"):
+        again = after("trial", name)
+        os.utime(max(tmp_path.iterdir(), key=lambda f: f.stat().st_mtime_ns), (i, i))
+    assert [again("trial", name).left(20.0, 0.2, 40.0) for name in "abc"] == pytest.approx([40.0, 80.0, 80.0])
+
+
 def test_nothing_is_kept_of_short_commands_of_compilations_and_where_nothing_can_be_written(tmp_path, monkeypatch):
     def run(seconds, folder):
         memory = Remembered(LINE, folder)
