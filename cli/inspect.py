@@ -300,10 +300,10 @@ def _presets() -> Table:
 def _zoo() -> Table:
     from ..policy.foreign.zoo import zoo
 
-    columns = ("what it is", "file", "robot", "observation", "from", "licence", "left open by its authors")
+    columns = ("what it is", "file", "robot", "observation", "from", "licence", "left open by its authors, or to know")
     table = make_table("public policies that are known by their content (gaitgauge evaluate FILE)", *columns)
     for each in zoo().values():
-        words = (each.robot, each.observed(), each.source, each.licence, each.note or "")
+        words = (each.robot, each.observed(), each.source, each.licence, each.note or each.remark or "")
         table.add_row(each.title, each.file, *words)
     return table
 

@@ -227,7 +227,8 @@ def load_entries(data: bytes, *, source: str) -> Mapping[str, Any]:
     others = [n for n in reading.names if n not in _PLAIN_CALLS]
     if strange := [n for n in others if n in called or not _PLAIN_NAMES.fullmatch(n)]:
         raise PolicyError(
-            f"'{source}' holds more than tensors and plain data ('{strange[0].replace(' ', '.')}'), and was not loaded"
+            f"'{source}' holds more than tensors and plain data ('{strange[0].replace(' ', '.')}'), and was not loaded; "
+            "export the policy as TorchScript or ONNX"
         )
     sizes = {name.partition("/")[2]: len(content) for name, content in records.items() if name.startswith("data/")}
     check_tensors((c for c in reading.calls if c.function.name == REBUILD_TENSOR), sizes, source=source)

@@ -270,7 +270,7 @@ def observation(name: str) -> Observation:
     if name not in installed:
         names = dict.fromkeys((*OBSERVATIONS, *installed))
         near = did_you_mean(name, names)
-        raise ObservationError(f"unknown observation term {shown(name)}{near}; choose from: {', '.join(names)}")
+        raise ObservationError(f"unknown observation term {shown(name)}{near or ';'} choose from: {', '.join(names)}")
     found = load_plugin(installed[name], ObservationError)
     if not isinstance(found, Observation) or found.name != name:
         raise ObservationError(

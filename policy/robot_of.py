@@ -38,8 +38,8 @@ def robot_for(contract: PolicyContract, asked: str | None = None) -> Robot:
         robot = load_robot(contract.robot)
     else:
         raise RobotError(
-            f"the policy is for the robot '{contract.robot}', which is not installed and which it does not carry; say where "
-            "its robot.toml is with --robot"
+            f"the policy is for the robot '{contract.robot}', which is not installed and which it does not carry; give "
+            "its robot.toml with --robot ('gaitgauge robot new MODEL.xml' writes one)"
         )
     check_robot(contract, robot)
     if notice:

@@ -81,7 +81,7 @@ def described(contract: PolicyContract) -> str | None:
     file = contract.provenance.get("file")
     if adapter == "zoo" or adapter.startswith("preset "):
         where = f"the zoo's {file}" if adapter == "zoo" else f"the {adapter}"
-        return f"is run as {where} says" + (f"; {assumed}" if assumed else "")
+        return "; ".join(filter(None, (f"is run as {where} says", assumed, contract.provenance.get("remark"))))
     source = f"'{file}'" if adapter in (None, file) or "metadata" in adapter else f"'{file}' ({adapter})"
     return f"is run as {'its metadata say' if 'metadata' in adapter else source + ' says'}" + (
         f"; {assumed}" if assumed else ""

@@ -35,7 +35,7 @@ def choose_robot(asked: Robot | None, named: str | None, source: object) -> Robo
     if known is None:
         raise PolicyError(
             f"'{source}' describes a policy for robot {shown(named)}, which is not installed (there are {', '.join(robot_names())})"
-            f"{did_you_mean(named, robot_names())}; "
+            f"{did_you_mean(named, robot_names()) or ';'} "
             "give its robot.toml with --robot ('gaitgauge robot new MODEL.xml' writes one)"
         )
     return load_robot(known)

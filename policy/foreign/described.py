@@ -96,7 +96,7 @@ def _usual(data: dict[str, Any], robot: Robot, preset: object, source: str) -> d
     for name in names if isinstance(names, list) else ():
         if name not in robot.joint_names:
             raise PolicyError(
-                f"{source} is wrong: robot '{robot.name}' has no joint {shown(name)}{did_you_mean(name, robot.joint_names)}; "
+                f"{source} is wrong: robot '{robot.name}' has no joint {shown(name)}{did_you_mean(name, robot.joint_names) or ';'} "
                 f"it has {', '.join(robot.joint_names)}"
             )
     if isinstance(names, list) and len(names) == robot.num_joints and all(n in names for n in robot.joint_names):
@@ -158,7 +158,7 @@ default_joint_position = {pose}
 action_scale = {scale}
 # action_clip = 100.0                # of the network's output; last_action shows the clipped one
 # target_range = [-2.5, 2.5]         # lowest and highest joint target, or a pair per joint
-# velocity_joints = [...]            # wheels: their targets and action_scale are speeds [rad/s]
+{wheels}  # wheels: their targets and action_scale are speeds [rad/s]
 # Gains of the motors: kp [N·m/rad], kd [N·m·s/rad].
 stiffness = {stiffness}
 damping = {damping}
@@ -200,6 +200,9 @@ def template(robot: Robot) -> str:
         joints=json.dumps(contract.joint_names),
         pose=json.dumps(contract.default_joint_position),
         scale=numbers(contract.action_scale),
+        wheels=f"velocity_joints = {json.dumps(wheels)}"
+        if (wheels := contract.velocity_joints)
+        else "# velocity_joints = [...]",
         stiffness=numbers(contract.stiffness),
         damping=numbers(contract.damping),
         period=contract.control_period,

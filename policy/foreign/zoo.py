@@ -39,6 +39,8 @@ class KnownPolicy:
     """A ``contract.toml``."""
     note: Text | None = None
     """Settings that its authors' files leave open."""
+    remark: Text | None = None
+    """What else its user has to know."""
 
     @property
     def robot(self) -> str:
@@ -73,6 +75,8 @@ def known_contract(known: KnownPolicy, asked: Robot | None) -> PolicyContract:
     provenance = {"adapter": ADAPTER, "file": known.name, "source": known.source, "licence": known.licence}
     if known.note is not None:
         provenance["assumed"] = known.note
+    if known.remark is not None:
+        provenance["remark"] = known.remark
     source = f"{known.file} ({known.name})"
     try:
         robot: Robot | None = choose_robot(asked, known.robot, source)

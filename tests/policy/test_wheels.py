@@ -9,6 +9,7 @@ from gaitgauge.policy.base import PolicyError
 from gaitgauge.policy.contract import standard_contract
 from gaitgauge.policy.export.files import ExportError, deploy_settings
 from gaitgauge.policy.foreign.deploy_yaml import read_deploy
+from gaitgauge.policy.foreign.described import described_contract, template
 from gaitgauge.policy.foreign.isaac_lab import read_env
 from gaitgauge.policy.foreign.rl_sar import read_rl_sar
 from gaitgauge.robots import load_robot
@@ -72,6 +73,13 @@ def test_lists_of_the_legs_alone_get_the_robots_own_wheels():
     settings["actions"]["JointVelocityAction"]["joint_ids"] = [12, 13, 14]
     with pytest.raises(PolicyError, match=r"every number from 0 to 15 is needed once for robot 'go2w'"):
         read_deploy(settings, Path("deploy.yaml"), GO2W)
+
+
+def test_a_contract_that_is_written_for_a_robot_with_wheels_names_them(tmp_path):
+    path = tmp_path / "contract.toml"
+    path.write_text(template(GO2W))
+    assert 'velocity_joints = ["FL_foot_joint", "FR_foot_joint"' in path.read_text()
+    assert described_contract(path, None).hash == standard_contract(GO2W).hash
 
 
 def settings_of_rl_sar(folder):

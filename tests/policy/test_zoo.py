@@ -13,6 +13,7 @@ from gaitgauge.gauge.suite import load_suite
 from gaitgauge.policy import loading
 from gaitgauge.policy.base import PolicyError
 from gaitgauge.policy.contract import standard_contract
+from gaitgauge.policy.foreign.adapters import described
 from gaitgauge.policy.foreign.described import described_contract
 from gaitgauge.policy.foreign.presets import find_preset, preset_contract
 from gaitgauge.policy.foreign.zoo import KnownPolicy, known_contract, zoo
@@ -64,7 +65,7 @@ def test_the_page_lists_what_the_zoo_knows():
     page = (Path(__file__).parents[2] / "docs/reference/zoo.md").read_text(encoding="utf-8")
     for known in zoo().values():
         row = f"| {known.title} | `{known.robot}` | `{known.file}` | `{known.sha256[:16]}…` | {known.source} | {known.licence} |"
-        assert f"{row} {known.note or ''} |" in page
+        assert f"{row} {known.note or known.remark or ''} |" in page
 
 
 @pytest.fixture
@@ -78,6 +79,7 @@ def known(monkeypatch, files):
         source="a project",
         licence="MIT",
         note="the rest",
+        remark="it limps",
         contract={"robot": "go2", "preset": "himloco", "history": {"length": 6}, "command_limits": [0.5, 0.4, 0.3]},
     )
     monkeypatch.setattr(loading, "zoo", lambda: {entry.sha256: entry})
@@ -88,6 +90,7 @@ def test_a_known_file_needs_no_description(known):
     contract = load_policy(known).contract
     assert contract.hash == replace(HIMLOCO, command_limits=(0.5, 0.4, 0.3)).hash
     assert contract.provenance["licence"] == "MIT" and contract.provenance["assumed"] == "the rest"
+    assert described(contract) == "is run as the zoo's mine says; assumed: the rest; it limps"
 
 
 def test_contract_show_needs_no_robot(files, monkeypatch, capsys):

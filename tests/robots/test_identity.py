@@ -90,6 +90,8 @@ def test_robot_of_a_policy(unseen, caplog):
     assert robot_for(contract).joint_names == unseen.joint_names
     assert "the robot is the copy that the policy carries" in caplog.text
     assert "files" not in without_copy(contract.provenance)[REMEMBERED]
-    with pytest.raises(RobotError, match="is not installed and which it does not carry"):
+    with pytest.raises(
+        RobotError, match=r"is not installed and which it does not carry; give its robot.toml with --robot"
+    ):
         robot_for(replace(contract, provenance={}))
     assert robot_for(standard_contract(load_robot("go2"))) == load_robot("go2")
