@@ -334,6 +334,8 @@ def main() -> int:
     parser.add_argument("--terrain", action="append", help="instead of all of the suite; more than once for several")
     parser.add_argument("--friction", type=float, action="append", help="instead of 0.3, 0.6 and 0.9")
     arguments = parser.parse_args()
+    if min(arguments.listed, arguments.fresh) < 2:
+        parser.error("--listed and --fresh must be 2 or more: a bound needs two seeds")
     arguments.folder.mkdir(parents=True, exist_ok=True)
     prepared = prepare(Request(policy=arguments.policy, suite="gaitgauge-1", frictions=(0.6,), payloads=(0.0,)))
     torch.set_num_threads(1)

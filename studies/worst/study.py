@@ -53,7 +53,7 @@ CONFIRMING = range(6, 12)
 """Seeds with which a failure of the gallery is played again: the search has seen none of them."""
 GALLERY = 10
 """Failures that are filmed."""
-_SAMPLED = 0.35
+_SAMPLED = 0.25
 """Share of the budget that the random sample takes."""
 _NEEDED, _SETTLED = 0.5, 0.85
 """Shares of the budget at which it is no longer asked what the falls of the sample need, and what those of the search need."""
