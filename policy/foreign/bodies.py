@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from typing import Any
 
@@ -41,12 +41,18 @@ def choose_robot(asked: Robot | None, named: str | None, source: object) -> Robo
     return load_robot(known)
 
 
-def wheeled_robot(source: object) -> tuple[Robot, str | None]:
-    """Return the robot of a description that drives wheels and names none, and what that assumes: the installed one with wheels."""
-    wheeled = [robot for robot in map(load_robot, robot_names()) if robot.velocity_joints]
-    if len(wheeled) == 1:
-        return wheeled[0], f"robot '{wheeled[0].name}', the one with wheels that is installed"
-    return choose_robot(None, None, source), None
+def fitting_robot(fits: Callable[[Robot], bool], feature: str, source: object) -> tuple[Robot, str | None]:
+    """Return the robot of a description that names none: the Go2, or where that does not fit, the one installed robot that does.
+
+    The second value says what that assumes, in words, with ``feature``: what the description tells of its robot.
+    """
+    usual = choose_robot(None, None, source)
+    if fits(usual):
+        return usual, None
+    fitting = [robot for robot in map(load_robot, robot_names()) if fits(robot)]
+    return (
+        (usual, None) if len(fitting) != 1 else (fitting[0], f"robot '{fitting[0].name}', the only one with {feature}")
+    )
 
 
 def _same(named: str, name: str) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ from ...robots.base import Robot
 from ..base import PolicyError
 from ..contract import History, HistoryOrder, ObservationTerm, Part, PolicyContract, without_wheels
 from ..observation_table import HEIGHT_SCAN, WITHOUT_WHEELS
-from .bodies import choose_robot, sdk_joints, wheeled_robot, wheels_of
+from .bodies import fitting_robot, sdk_joints, wheels_of
 from .terms import ISAAC_HEIGHT, checked, clip_before_scaling, listed, own_term, symmetric, usual_scan
 
 
@@ -37,7 +37,7 @@ def read_deploy(data: Mapping[str, Any], path: Path, asked: Robot | None, *, of_
     ``use_gym_history`` is set, and start with copies of the first observation. Clipping comes before scaling unless
     ``scale_first`` is set; a clip of the action limits the joint target. ``JointVelocityAction`` drives wheels; lists of the
     legs alone are completed with the robot's gains and pose of its wheels. Without ``asked``, the robot is the Go2, or the one
-    installed robot with wheels.
+    installed robot that fits.
 
     Args:
         of_mjlab: the policy's file has mjlab's metadata; unitree_rl_mjlab's gait phase is zero while the command is.
@@ -47,7 +47,10 @@ def read_deploy(data: Mapping[str, Any], path: Path, asked: Robot | None, *, of_
     """
     with checked(path, "deploy.yaml"):
         turned = dict(data["actions"]).get(_TURNED) is not None
-        robot, chosen = wheeled_robot(path) if turned and asked is None else (choose_robot(asked, None, path), None)
+        joints = len(data["joint_ids_map"])
+        fits: Callable[[Robot], bool] = lambda r: bool(r.velocity_joints) if turned else r.num_joints == joints  # noqa: E731
+        feature = "wheels" if turned else f"{joints} joints"
+        robot, chosen = (asked, None) if asked else fitting_robot(fits, feature, path)
         data, completed = _with_wheels(data, robot) if turned else (data, None)
         contract = _read(data, path, robot)
     assumed = [contract.provenance.get("assumed"), chosen, completed]

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 
 from ...robots.base import Robot
 from ..base import PolicyError
 from ..contract import History, ObservationTerm, PolicyContract
 from ..observation_table import HEIGHT_SCAN
-from .bodies import choose_robot, matching_joint
+from .bodies import fitting_robot, matching_joint
 from .terms import checked, clip_before_scaling, own_term, symmetric, usual_scan
 
 
@@ -26,13 +27,18 @@ def mjlab_contract(metadata: Mapping[str, str], asked: Robot | None, *, source: 
     if "observation_names" not in metadata or "joint_names" not in metadata:
         return None
     with checked(source, "mjlab's metadata"):
-        return _mjlab_contract(metadata, choose_robot(asked, None, source), source)
+        named = _words(metadata, "joint_names")
+        fits: Callable[[Robot], bool] = lambda r: {matching_joint(n, r) for n in named} == set(r.joint_names)  # noqa: E731
+        robot, chosen = (asked, None) if asked else fitting_robot(fits, "its joints", source)
+        return _mjlab_contract(metadata, robot, [chosen] if chosen else [], source)
 
 
-def _mjlab_contract(metadata: Mapping[str, str], robot: Robot, source: str) -> PolicyContract:
-    def words(key: str, default: str = "") -> list[str]:
-        return [w.strip() for w in metadata.get(key, default).split(",") if w.strip()]
+def _words(metadata: Mapping[str, str], key: str) -> list[str]:
+    return [w.strip() for w in metadata.get(key, "").split(",") if w.strip()]
 
+
+def _mjlab_contract(metadata: Mapping[str, str], robot: Robot, assumed: list[str], source: str) -> PolicyContract:
+    words = partial(_words, metadata)
     names = tuple(matching_joint(n, robot) for n in words("joint_names"))
     observations = words("observation_names")
     own = [own_term(name, source) for name in observations]
@@ -57,7 +63,7 @@ def _mjlab_contract(metadata: Mapping[str, str], robot: Robot, source: str) -> P
         clip = clip_before_scaling(limit, scale)
         known = None if limit == math.inf else clip if len(clip) > 1 else clip[0]
         terms.append(ObservationTerm(name=term, scale=scale, clip=known))
-    assumed = ["control period 0.02 s", f"command limits of robot '{robot.name}'"]
+    assumed += ["control period 0.02 s", f"command limits of robot '{robot.name}'"]
     assumed += [usual_scan(0.0)] if HEIGHT_SCAN in own else []
     action_scale = [float(v) for v in words("action_scale")]
     return PolicyContract(

@@ -42,10 +42,14 @@ from foreign_play import (
     term_major,
 )
 from gaitgauge.policy.base import PolicyError
+from gaitgauge.policy.contract import standard_contract
+from gaitgauge.policy.export.files import deploy_settings
 from gaitgauge.policy.foreign.adapters import described as described_in_words
 from gaitgauge.policy.foreign.deploy_yaml import read_deploy
+from gaitgauge.policy.foreign.mjlab import mjlab_contract
 from gaitgauge.policy.loading import load_policy
 from gaitgauge.policy.observation import ObservationBuilder
+from gaitgauge.robots import load_robot
 from onnx import helper
 from scipy.spatial.transform import Rotation
 from torch import nn
@@ -101,6 +105,29 @@ def test_histories_of_different_lengths_in_a_deploy_file(tmp_path):
         return np.concatenate([kept[-n + j][i] for i, n in enumerate(lengths) for j in range(n)], axis=1)
 
     check(policy, isaac, stack, simply(module))
+
+
+def test_the_only_robot_with_a_descriptions_joints_is_taken():
+    g1 = load_robot("g1")
+    own = standard_contract(g1)
+    contract = read_deploy(deploy_settings(own, g1), Path("deploy.yaml"), None)
+    assert contract.joint_names == own.joint_names
+    assert contract.provenance["assumed"] == "robot 'g1', the only one with 29 joints"
+    metadata = {
+        "joint_names": ",".join(own.joint_names),
+        "observation_names": "joint_pos,actions",
+        "action_scale": "0.5",
+    }
+    for key, values in (
+        ("default_joint_pos", own.default_joint_position),
+        ("joint_stiffness", own.stiffness),
+        ("joint_damping", own.damping),
+    ):
+        metadata[key] = ",".join(map(str, values))
+    found = mjlab_contract(metadata, None, source="policy.onnx")
+    assert found.robot == "g1" and found.provenance["assumed"].startswith(
+        "robot 'g1', the only one with its joints, control"
+    )
 
 
 def test_what_a_deploy_file_asks_for_in_vain_is_named(tmp_path):

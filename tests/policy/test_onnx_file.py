@@ -211,7 +211,7 @@ def changed_term(**changes: object) -> dict:
     ("changes", "named"),
     [
         ({"joint_ids_map": [0] * 12}, "joint_ids_map"),
-        ({"joint_ids_map": list(range(29))}, "'g1' has 29 joints: --robot chooses another"),
+        ({"joint_ids_map": list(range(29))}, "has 12 values of default_joint_pos; 29 are needed"),
         ({"stiffness": [20.0] * 3}, "has 3 values of stiffness; 12 are needed"),
         ({"actions": {}}, "lacks 'JointPositionAction' of deploy.yaml"),
         ({"actions": {"JointPositionAction": {"scale": 0.25, "offset": [0.0] * 11}}}, "deploy.yaml"),

@@ -65,8 +65,7 @@ def test_lists_of_the_legs_alone_get_the_robots_own_wheels():
     assert contract.stiffness == (20.0,) * 12 + (0.0,) * 4 and contract.damping == (0.5,) * 16
     assert contract.default_joint_position[12:] == (0.0,) * 4
     assert contract.provenance["assumed"] == (
-        "robot 'go2w', the one with wheels that is installed; "
-        "gains of the wheels of robot 'go2w', because its lists hold 12 joints"
+        "robot 'go2w', the only one with wheels; gains of the wheels of robot 'go2w', because its lists hold 12 joints"
     )
     with pytest.raises(PolicyError, match="as wheels are, and robot 'go2' takes targets of angle alone"):
         read_deploy(settings, Path("deploy.yaml"), GO2)
