@@ -205,3 +205,12 @@ def test_without_self_collision_parts_meet_the_ground_alone(name: str):
     for (model, none), (_, every) in zip(pairs(False), pairs(True), strict=True):
         ground = {model.geom(g).name for g in range(model.ngeom) if model.body_weldid[model.geom_bodyid[g]] == 0}
         assert none == {pair for pair in every if pair & ground} and none < every
+
+
+@pytest.mark.parametrize(("name", "kind"), [("go2w", "mjJAC_AUTO"), ("g1", "mjJAC_SPARSE")])
+def test_constraints_of_a_humanoid_alone_have_sparse_jacobians(name: str, kind: str):
+    """Scores of four legs were published with dense ones, and differ in the last bits with others."""
+    robot = load_robot(name)
+    ground = {"terrains": (make_terrain("flat", 0),), "terrain_index": (0,)}
+    scene = Scene(robot=robot, parameters=next(iter(robot.parameters.values())), **ground, physics=PhysicsOptions())
+    assert build_models(scene)[0].opt.jacobian == getattr(mujoco.mjtJacobian, kind)
