@@ -385,6 +385,12 @@ def test_page_is_self_contained_and_escapes_names(drifted, tmp_path):
         write_page(tmp_path / "empty")
 
 
+def test_a_head_breaks_before_an_engine_s_setting():
+    """The table of the closed loop was wider than a page of 1,400 pixels, and its verdicts were out of sight."""
+    seed = Path(__file__).parents[1] / "fuzz" / "seeds" / "consistency" / "consistency.json"
+    assert "<th>mujoco@\u200btimestep=0.005</th>" in render(json.loads(seed.read_text()))
+
+
 def test_several_policies_have_folders_of_their_own(request_of, tmp_path):
     name = request_of().policies[0]
     results = study(request_of(policies=(name, name)), tmp_path / "out", make=engine())
