@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from .picture import Quality
 
 _EVERYTHING = "everything"
+_UNSEEN = ("description", "size", "base", "joints", "feet", "bodies and sites")
+"""Checks without which there is no picture; one of a pose that fails is needed most."""
 _SIDES = (90.0, 215.0)
 """Directions in which the camera looks in the two views of a standing robot, from its right and from before it [deg]."""
 
@@ -162,7 +164,8 @@ def check_robot_files(asked: str, *, picture: Path | None, json_output: bool) ->
         findings = [Finding(check="description", passed=False, sentence=str(error), needed_for=_EVERYTHING)]
     sound = all(f.passed for f in findings if f.needed_for == _EVERYTHING)
     drawn = None
-    if sound and robot is not None and quality is not None and picture is not None:
+    unseen = any(f.check in _UNSEEN and not f.passed for f in findings)
+    if robot is not None and not unseen and quality is not None and picture is not None:
         drawn = picture
         _draw(robot, quality, picture)
     if json_output:

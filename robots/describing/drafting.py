@@ -20,11 +20,11 @@ from ..anatomy.roles import WORDS
 from ..base import JointParameters
 from ..checks.apart import run_apart
 from ..checks.checking import compiled
-from ..checks.standing import MOST_SAG, stand_still
+from ..checks.standing import MOST_SAG, Stance, stand_still
 from ..loading import RobotError, fits
 from .mending import mend
 from .motor_guess import Remarked, guess_motors
-from .posing import standing_pose
+from .posing import BENDS, standing_pose
 from .surveying import GRAVITY, Answers, Survey
 
 if TYPE_CHECKING:
@@ -148,12 +148,20 @@ def _draft(path: Path, name: str | None, home: Path, answers: Answers) -> str:
     mends += survey.mends
     model = survey.model
     title = name or (spec.modelname if spec.modelname not in ("", "MuJoCo Model") else path.stem)
-    pose, how = standing_pose(survey)
     joints = list(dict.fromkeys([j for leg in survey.legs for j in leg.joints] + survey.hinges))
     names = [model.joint(j).name for j in joints]
-    survey.place(pose)
     length = float(np.mean([survey.leg_length(leg) for leg in survey.legs]))
     two = len(survey.legs) == 2
+    bends = BENDS[survey.plan in ("biped", "humanoid")]
+    pose, how = standing_pose(survey, bends[0])
+    motors = _standing_motors(survey, pose, joints, length, actuated)
+    if _GUESSED in how and not motors["stiffness"][1].startswith(_GUESSED):
+        for bend in bends[1:]:
+            if _stands(_stance(survey, pose, joints, motors), survey, length):
+                break
+            pose, how = standing_pose(survey, bend)
+            how += "; straighter than usual, since the model's gains hold no more"
+    survey.place(pose)
     fast = round(min(1.0, 0.4 * math.sqrt(GRAVITY * length)) if two else min(2.0, math.sqrt(GRAVITY * length)), 1)
     height = math.ceil(1000 * (survey.depth() + _CLEARANCE)) / 1000
     sites = [model.site(s).name for s in range(model.nsite) if model.site_bodyid[s] == survey.base]
@@ -193,7 +201,6 @@ def _draft(path: Path, name: str | None, home: Path, answers: Answers) -> str:
         entries.append(
             Entry("variants.legs.driven_joints", legs, "for policies that drive the legs alone and hold the rest")
         )
-    motors = _standing_motors(survey, pose, joints, length, actuated)
     for key, (value, remark) in motors.items():
         table = joint_table(names, value) if isinstance(value, list) else value
         entries.append(Entry(f"parameters.gauge.{key}", table, remark))
@@ -282,18 +289,11 @@ def _standing_motors(
     guess, remark = first["stiffness"]
     if not remark.startswith(_GUESSED):
         return first
-    angles = {survey.model.joint(j).name: round(pose[j], 4) for j in joints}
-    survey.place(dict(pose))
-    height, stances = survey.feet_depth(), []
-    most = max(guess)
+    stances, most = [], max(guess)
     for stiffer in _STIFFER:
         motors = first if stiffer == 1.0 else guess_motors(survey, joints, length, actuated, stiffer)
-        constants: dict[str, Any] = {
-            key: tuple(np.broadcast_to(value, len(joints)).tolist()) for key, (value, _) in motors.items()
-        }
-        held = len(survey.legs) == 2  # two legs fall over whatever their stiffness
-        stances.append(stand_still(survey.spec.copy(), angles, JointParameters(**constants), height, upright=held))
-        if stances[-1].stands(lowest=1.0 - MOST_SAG * length / height, most_tilt=_MOST_TILT):
+        stances.append(_stance(survey, pose, joints, motors))
+        if _stands(stances[-1], survey, length):
             if stiffer > 1.0:
                 raised = f"{remark}, and raised from {most:g}, with which it does not stand well"
                 motors["stiffness"] = (motors["stiffness"][0], raised)
@@ -305,6 +305,22 @@ def _standing_motors(
     mended = "mend default_joint_position, torque_limit and stiffness until robot check passes"
     first["stiffness"] = (guess, f"{remark}; {weak}; {mended}")
     return first
+
+
+def _stance(survey: Survey, pose: Mapping[int, float], joints: list[int], motors: Mapping[str, Remarked]) -> Stance:
+    """Return how the robot stands in a pose; two legs are held upright, since they fall over whatever their stiffness."""
+    angles = {survey.model.joint(j).name: round(pose[j], 4) for j in joints}
+    constants: dict[str, Any] = {
+        key: tuple(np.broadcast_to(value, len(joints)).tolist()) for key, (value, _) in motors.items()
+    }
+    survey.place(dict(pose))
+    height, held = survey.feet_depth(), len(survey.legs) == 2
+    return stand_still(survey.spec.copy(), angles, JointParameters(**constants), height, upright=held)
+
+
+def _stands(stance: Stance, survey: Survey, length: float) -> bool:
+    """Return whether the robot as it was placed last stands well enough for ``robot check``."""
+    return stance.stands(lowest=1.0 - MOST_SAG * length / survey.feet_depth(), most_tilt=_MOST_TILT)
 
 
 def _toml(value: Any) -> str:

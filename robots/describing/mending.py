@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 _GRAVITY = (0.0, 0.0, -9.81)
 _COLLISION_GROUP = 3
 """Group of shapes that collide, by custom."""
+_REFERENCES = ("objname", "refname", "geomname1", "geomname2", "bodyname1", "bodyname2")
+"""Fields in which sensors, contact pairs and exclusions name their parts."""
 
 
 def mend(path: Path, spec: mujoco.MjSpec, model: mujoco.MjModel) -> list[str]:
@@ -51,15 +53,17 @@ def mend(path: Path, spec: mujoco.MjSpec, model: mujoco.MjModel) -> list[str]:
                 f"the free joint has {', '.join(found)}, perhaps of a <default>, which would carry the robot: taken out",
                 free_line,
             )
-    beside = list(spec.worldbody.geoms)
-    for geom in beside:
+    gone: set[str] = set()
+    for geom in list(spec.worldbody.geoms):
         name = f" '{geom.name}'" if geom.name else ""
         note(
             f"the geom{name} of the world, such as a floor, is none of the robot: taken out", _named("geom", geom.name)
         )
+        gone.add(geom.name)
         spec.delete(geom)
     for site in list(spec.worldbody.sites):
         note(f"the site '{site.name}' of the world is none of the robot: taken out", _named("site", site.name))
+        gone.add(site.name)
         spec.delete(site)
     base = int(model.body_rootid[model.jnt_bodyid[free[0][0]]]) if len(free) == 1 else -1
     for root, body in zip(roots, list(spec.worldbody.bodies), strict=True):
@@ -67,7 +71,17 @@ def mend(path: Path, spec: mujoco.MjSpec, model: mujoco.MjModel) -> list[str]:
             note(
                 f"the body '{body.name}' hangs on the world and not on the robot: taken out", _named("body", body.name)
             )
+            parts = (part for kind in ("body", "geom", "site", "joint") for part in body.find_all(kind))
+            gone.update((body.name, *(part.name for part in parts)))
             spec.delete(body)
+    gone.discard("")
+    for element in (
+        *spec.sensors,
+        *spec.pairs,
+        *spec.excludes,
+    ):  # MuJoCo does not compile what names a part that is gone
+        if any(getattr(element, key, "") in gone for key in _REFERENCES):
+            spec.delete(element)
     held = (mujoco.mjtEq.mjEQ_WELD, mujoco.mjtEq.mjEQ_CONNECT)
     for equality in list(spec.equalities):
         if equality.type in held and "world" in (equality.name1 or "world", equality.name2 or "world"):

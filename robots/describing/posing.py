@@ -13,18 +13,22 @@ from ..checks.standing import FOLDED
 from ..loading import RobotError, fits
 from .surveying import Leg, Survey
 
-_BEND = {True: 0.95, False: 0.8}
-"""Distance from hip to foot of a standing leg over that of a stretched one, for two legs and for more: 0.96 for the G1, 0.73 for
-the Go2, 0.85 for ANYmal C."""
+BENDS = {True: (0.95, 0.98, 0.99), False: (0.8,)}
+"""Distances from hip to foot of a standing leg over that of a stretched one, for two legs and for more: 0.96 for the G1, 0.73 for
+the Go2, 0.85 for ANYmal C. The later ones are for two legs that the model's own gains do not hold with more bent knees."""
 _BEHIND = 0.1
 """Offset of a standing foot from its hip, away from the knee, over leg length: under load knees yield and hips follow."""
 _WIDEST = 2.8
 """Largest joint angle of a pose [rad]."""
 
 
-def standing_pose(survey: Survey) -> tuple[dict[int, float], str]:
-    """Return an angle for each hinge, and its origin; raise ``RobotError`` where a pose or keyframe that was asked for cannot be."""
-    angles, origin = _unasked_pose(survey)
+def standing_pose(survey: Survey, bend: float) -> tuple[dict[int, float], str]:
+    """Return an angle for each hinge, and its origin; raise ``RobotError`` where a pose or keyframe that was asked for cannot be.
+
+    Args:
+        bend: of ``BENDS``, for a pose that has to be guessed.
+    """
+    angles, origin = _unasked_pose(survey, bend)
     if not survey.answers.pose:
         return angles, origin
     names = {joint: survey.model.joint(joint).name for joint in survey.hinges}
@@ -42,7 +46,7 @@ def standing_pose(survey: Survey) -> tuple[dict[int, float], str]:
     return angles, "as said" if every else f"as said for {', '.join(said)}; else {origin}"
 
 
-def _unasked_pose(survey: Survey) -> tuple[dict[int, float], str]:
+def _unasked_pose(survey: Survey, bend: float) -> tuple[dict[int, float], str]:
     model, asked = survey.model, survey.answers.keyframe
     names = [model.key(key).name or str(key) for key in range(model.nkey)]
     if asked is not None and asked not in names:
@@ -62,7 +66,7 @@ def _unasked_pose(survey: Survey) -> tuple[dict[int, float], str]:
     for _ in range(3):  # the legs move the centre of mass, over which two feet stand
         bent = dict(angles)
         for leg in survey.legs:
-            bent |= _bent(survey, leg, angles, survey.plan in ("biped", "humanoid"))
+            bent |= _bent(survey, leg, angles, bend)
         angles = bent
         if len(survey.legs) > 2:
             break
@@ -97,12 +101,12 @@ def _bounds(survey: Survey, joint: int) -> tuple[float, float]:
     return float(max(low, -_WIDEST)), float(min(high, _WIDEST))
 
 
-def _bent(survey: Survey, leg: Leg, pose: dict[int, float], two: bool) -> dict[int, float]:
+def _bent(survey: Survey, leg: Leg, pose: dict[int, float], bend: float) -> dict[int, float]:
     """Return the leg's angles with the foot below the hip, or below the centre of mass of a biped, the knee behind rather than in
     front of four legs and in front of two, and the sole level.
     """
     survey.place(pose)
-    bends = survey.bends(leg)
+    two, bends = survey.plan in ("biped", "humanoid"), survey.bends(leg)
     if len(bends) < 2:
         return {}
     hip, knee = bends[:2]
@@ -134,7 +138,7 @@ def _bent(survey: Survey, leg: Leg, pose: dict[int, float], two: bool) -> dict[i
         foot = reach(float(angle), pose[hip])
         lengths.append(float(np.linalg.norm(foot - across * (foot @ across))))
     stretched = int(np.argmax(lengths))
-    wanted = _BEND[two] * lengths[stretched]
+    wanted = bend * lengths[stretched]
     found: list[tuple[float, bool, dict[int, float]]] = []
     for side in (range(stretched + 1), range(stretched, len(grid))):
         nearest = min(side, key=lambda i: abs(lengths[i] - wanted))

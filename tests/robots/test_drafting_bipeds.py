@@ -17,7 +17,8 @@ from stick_robot import PLATE, SHANKS, write_stick
 pytestmark = pytest.mark.usefixtures("robots_are_tried_here")
 
 PASSIVE = '<default><joint damping="0.3" armature="0.01"/></default>'
-FLOOR = (
+FLOOR = (  # and what names parts that are taken out
+    '<contact><exclude body1="table" body2="pelvis"/></contact><sensor><framepos objtype="geom" objname="floor"/></sensor>'
     '<worldbody><geom name="floor" type="plane" size="1 1 1"/><body name="table" pos="2 0 0"><geom size="0.1"/></body>'
 )
 LYING = "0 0 0.1 1 0 0 0" + " 0 0 -1.4 2.4 -0.9 0" * 2
@@ -125,6 +126,16 @@ def test_a_keyframe_in_which_the_robot_lies_is_no_standing_pose(tmp_path):
     assert "left (" in pose.sentence and "right (" in pose.sentence
     with pytest.raises(RobotError, match="has no keyframe 'down'; it has home, up"):
         draft_robot(model, answers=Answers(keyframe="down"))
+
+
+def test_legs_that_the_model_s_own_gains_do_not_hold_bent_are_straighter(tmp_path):
+    motors = "".join(f'<position joint="{side}_{joint}" kp="15"/>' for side in "lr" for joint in "abcdef")
+    draft, robot = described(write_biped(tmp_path, more=f"<actuator>{motors}</actuator>"))
+    of = {entry.key: entry for entry in draft.entries}
+    assert of["parameters.gauge.stiffness"].value == 15.0
+    assert of["default_joint_position"].remark.endswith("; straighter than usual, since the model's gains hold no more")
+    assert 0.1 < robot.default_joint_position[3] < 0.5, "0.59 with gains of its own"
+    assert next(f for f in examine(robot) if f.check == "load").passed
 
 
 def test_guesses_are_made_again_after_an_edit(tmp_path):
