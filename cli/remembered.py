@@ -28,9 +28,12 @@ _MOST = 3.0
 """Greatest correction of an estimate, as a factor or a divisor."""
 
 
-def folder_of_times() -> Path:
-    """Return where times are kept: a folder of the user's cache."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "gaitgauge" / "times"
+def folder_of_times() -> Path | None:
+    """Return where times are kept: a folder of the user's cache; None for a user without a home."""
+    try:
+        return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "gaitgauge" / "times"
+    except RuntimeError:
+        return None
 
 
 class Remembered:

@@ -3,13 +3,14 @@
 import io
 import os
 import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 from gaitgauge.cli.console import Terminal
 from gaitgauge.cli.errors import UserError
 from gaitgauge.cli.progress import ProgressDisplay
-from gaitgauge.cli.remembered import Remembered
+from gaitgauge.cli.remembered import Remembered, folder_of_times
 
 LINE = ("evaluate", "p.pt", "--out", "a")
 
@@ -76,6 +77,16 @@ def test_nothing_is_kept_of_short_commands_of_compilations_and_where_nothing_can
     assert not run(20.0, tmp_path / "c")
     os.utime(kernels / "step", (1e9, 1e9))
     assert run(20.0, tmp_path / "c") == 1
+
+
+def test_a_user_without_a_home_has_no_memory(monkeypatch):
+    """Such as ``docker run --user`` makes, with an image that sets no HOME."""
+    monkeypatch.setenv("XDG_CACHE_HOME", "/cache")
+    assert folder_of_times() == Path("/cache/gaitgauge/times")
+    for name in ("XDG_CACHE_HOME", "HOME", "USERPROFILE"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr("os.path.expanduser", lambda path: path)
+    assert folder_of_times() is None
 
 
 def test_a_command_shows_its_last_time_from_the_start(tmp_path, monkeypatch):
