@@ -29,6 +29,21 @@ _ACTIVATIONS = {
 }
 
 
+def steps_between_calls(network: MotorNetwork, timestep: float, control_period: float) -> int:
+    """Return the number of physics steps, ``timestep`` [s] each, for which a network's torque is held.
+
+    Raises:
+        BackendError: physics steps do not divide the network's period, or that does not divide the control period [s].
+    """
+    pieces, periods = network.period / timestep, control_period / network.period
+    if round(pieces) < 1 or abs(pieces - round(pieces)) > 1e-6 or abs(periods - round(periods)) > 1e-6:
+        raise BackendError(
+            f"the motor network was made for a call every {1e3 * network.period:g} ms, which physics steps of {1e3 * timestep:g} ms in "
+            f"control steps of {1e3 * control_period:g} ms do not give; use a suite variant with 2.5 ms steps (gaitgauge-1-network)"
+        )
+    return round(pieces)
+
+
 class NetworkState:
     """The memory of a network for N × J joints, and its calls."""
 
@@ -115,14 +130,7 @@ class NetworkMotors(PhysicsBackend):
             )
         network = load_motor_network(scene.parameters.network)
         physics = scene.physics
-        pieces, periods = network.period / physics.timestep, physics.control_period / network.period
-        self._piece = round(pieces)
-        if self._piece < 1 or abs(pieces - self._piece) > 1e-6 or abs(periods - round(periods)) > 1e-6:
-            ms = f"{1e3 * network.period:g} ms"
-            raise BackendError(
-                f"the motor network was made for a call every {ms}, which physics steps of {1e3 * physics.timestep:g} ms in control "
-                f"steps of {1e3 * physics.control_period:g} ms do not give; use a suite variant with 2.5 ms steps (gaitgauge-1-network)"
-            )
+        self._piece = steps_between_calls(network, physics.timestep, physics.control_period)
         self.scene = scene
         inside = replace(scene, parameters=replace(scene.parameters, motor="torque", network=None))
         if not engine.torque_motors:

@@ -6,6 +6,7 @@ import math
 
 from ..policy.contract import PolicyContract
 from ..robots import Robot
+from ..robots.motor_network import load_motor_network
 from .motors import suite_parameters
 from .suite import Suite, SuiteError
 
@@ -19,8 +20,14 @@ def check_fit(suite: Suite, robot: Robot, contract: PolicyContract, *, longest: 
     Raises:
         RobotError: the robot lacks the suite's joint parameters.
         SuiteError: the policy was made for another control period, or for one above ``longest``.
+        BackendError: the motors are a network that cannot be called in the suite's physics steps.
+        MotorNetworkError: the network's file cannot be used.
     """
-    suite_parameters(suite, robot)
+    network = suite_parameters(suite, robot).network
+    if network is not None:
+        from ..backends.network_motors import steps_between_calls
+
+        steps_between_calls(load_motor_network(network), suite.physics.timestep, suite.physics.control_period)
     if abs(contract.control_period - suite.physics.control_period) > 1e-9:
         raise SuiteError(
             f"the policy was made for a control period of {contract.control_period:g} s, suite '{suite.name}' runs "

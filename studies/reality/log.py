@@ -75,12 +75,14 @@ class Log:
         """Return the rows from ``begin`` to ``end`` [s], their time counted from the first of them; raise ``LogError`` for too few."""
         rows = (self.time >= begin) & (self.time <= end)
         if rows.sum() < _LEAST_ROWS:
+            until = f"{end:g} s" if np.isfinite(end) else f"its end at {self.time[-1]:.2f} s"
             raise LogError(
-                f"log '{self.name}' has {int(rows.sum())} rows from {begin:g} s to {end:g} s; {_LEAST_ROWS} are needed"
+                f"log '{self.name}' has {int(rows.sum())} rows from {begin:g} s to {until}; {_LEAST_ROWS} are needed"
             )
         series = ("time", "target", "position", "velocity", "torque", "quaternion", "angular_velocity", "fresh")
         parts: dict[str, Any] = {key: None if (value := getattr(self, key)) is None else value[rows] for key in series}
-        return replace(self, **parts | {"time": parts["time"] - parts["time"][0]})
+        found = {**self.found, **_counted(parts["time"], parts["fresh"])}  # dropped rows are those of the whole log
+        return replace(self, **parts | {"time": parts["time"] - parts["time"][0], "found": found})
 
     def defects(self) -> str:
         """Return one sentence on the rows that were dropped or are not counted."""
@@ -127,7 +129,7 @@ def make_log(name: str, robot: Robot, columns: Mapping[str, Any], *, notes: Sequ
     position, time = series["position"], series["time"]
     fresh = np.append(True, (np.diff(position, axis=0) != 0).any(axis=1))
     steps = np.diff(time)
-    found |= {"repeated": int((~fresh).sum()), "late": int((steps > 1.75 * np.median(steps)).sum())}
+    found |= _counted(time, fresh)
     if fresh.mean() < 0.2:
         raise LogError(
             f"{source}: {found['repeated']} of {len(time)} rows repeat the row before; log no faster than the robot reports"
@@ -159,6 +161,12 @@ def make_log(name: str, robot: Robot, columns: Mapping[str, Any], *, notes: Sequ
     _check_joints(log, source)
     _check_velocity(log, source)
     return log
+
+
+def _counted(time: Array, fresh: NDArray[np.bool_]) -> dict[str, int]:
+    """Return the number of rows that repeat the last measurement and of those that are late."""
+    steps = np.diff(time)
+    return {"repeated": int((~fresh).sum()), "late": int((steps > 1.75 * np.median(steps)).sum())}
 
 
 def _cleaned(series: dict[str, Array], source: str) -> tuple[dict[str, Array], dict[str, int]]:

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from gaitgauge.backends.base import BackendError, PhysicsOptions, Scene
@@ -12,7 +13,8 @@ from gaitgauge.gauge.play.control_step import fixed_delay
 from gaitgauge.gauge.request import Request
 from gaitgauge.robots import RobotError, load_robot
 from gaitgauge.robots.loading import robot_digest
-from gaitgauge.robots.sets import find_set, set_text
+from gaitgauge.robots.motor_network import MotorNetwork, save_motor_network
+from gaitgauge.robots.sets import find_set, network_text, set_text
 from gaitgauge.terrains.registry import make_terrain
 
 GO2 = load_robot("go2", check=False)
@@ -49,6 +51,16 @@ def test_a_written_set_is_read_back(file):
         find_set(GO2, f"{file}:other")
     with pytest.raises(RobotError, match=r"no parameter set 'nope'; it has gauge, .* or give FILE.toml"):
         find_set(GO2, "nope")
+
+
+def test_motors_that_a_suite_cannot_call_are_refused_before_anything_is_played(tmp_path):
+    weights = {"weight_0": np.zeros((1, 2)), "bias_0": np.zeros(1)}
+    network = MotorNetwork(kind="feed-forward", arrays=weights)
+    save_motor_network(network, tmp_path / "net.npz")
+    text = network_text(GO2, "net", GO2.parameters["gauge"], network, passive=True)
+    (tmp_path / "net.toml").write_text(text, encoding="utf-8")
+    with pytest.raises(BackendError, match="a call every 5 ms, which physics steps of 2 ms"):
+        prepare(Request(policy="pretrained", suite="demo", parameters=str(tmp_path / "net.toml")))
 
 
 def test_an_evaluation_plays_the_set_and_records_it(file):

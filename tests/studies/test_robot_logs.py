@@ -155,6 +155,7 @@ def test_bad_rows_are_counted_and_handled(log, tmp_path):
     assert len(back.time) == len(log.time) - 2 and (np.diff(back.time) > 0).all()
     assert np.abs(back.position - np.interp(back.time, log.time, log.position[:, 0])[:, None]).min() < 1e-9
     assert "1 with a jump (dropped)" in back.defects()
+    assert back.cut(0.0, 0.3).found["repeated"] == 0 and back.cut(0.3, 1.0).found["repeated"] == 2
 
 
 @pytest.mark.parametrize(
