@@ -33,7 +33,7 @@ from .studies import resumable
 
 SLOWER = (
     "the suite commands more than the policy was made for; 'gaitgauge play POLICY' stays within its limits, and a suite with "
-    'commands.beyond = "clip" plays it there'
+    'commands.beyond = "clip", or for two legs gaitgauge-biped-1, plays it there'
 )
 """Advice for a policy that falls where more is commanded than it was made for."""
 
