@@ -41,9 +41,13 @@ def visual_model(robot: Robot, terrain: Terrain, quality: Quality = RICH) -> muj
         _add_geom(spec, "target", mujoco.mjtGeom.mjGEOM_CYLINDER, size=[0.12, 0.004, 0.0], pos=place, rgba=color)
     # Last, since drawing goes in this order: parts of the floor under steps need not be drawn.
     _add_floor(spec, reflectance=0.04 if quality.reflections else 0.0)
-    shown = any(geom.group == VISUAL_GROUP for geom in spec.geoms)
+    seen, solid = (
+        {geom.parent.name for geom in spec.geoms if geom.group == group} for group in (VISUAL_GROUP, COLLISION_GROUP)
+    )
     for geom in list(spec.geoms):
-        if geom.group == COLLISION_GROUP and shown:
+        if geom.group == COLLISION_GROUP and 2 * len(seen) > len(
+            solid
+        ):  # else the visible shapes are not all of the robot
             spec.delete(geom)
     return spec.compile()
 

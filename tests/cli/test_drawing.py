@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,6 +10,9 @@ from gaitgauge.cli import drawing
 from gaitgauge.cli.drawing import Shot, draw, processes_for
 from gaitgauge.cli.errors import UserError
 from gaitgauge.cli.picture import PLAIN, RICH, Follower, Tile, choose_renderer
+from gaitgauge.cli.scenery import visual_model
+from gaitgauge.robots import load_robot
+from gaitgauge.terrains import make_terrain
 
 TILES = [Tile(model=None, heading=0.0, leg_length=0.4), Tile(model=None, heading=1.0, leg_length=0.4)]
 
@@ -142,3 +146,16 @@ try:
 except UserError as error:
     print(error)
 """
+
+
+@pytest.mark.parametrize(("dressed", "groups"), [("b", {2, 3}), ("abc", {2})])
+def test_shapes_that_collide_are_drawn_where_the_robot_has_few_others(tmp_path, dressed, groups):
+    """A model may have visual shapes at its feet alone."""
+    bodies = "".join(
+        f'<body name="{name}" pos="0 0 {height}"><freejoint/><geom size="0.1" group="3"/>'
+        + ('<geom size="0.1" group="2" contype="0" conaffinity="0"/></body>' if name in dressed else "</body>")
+        for height, name in enumerate("abc", 1)
+    )
+    (tmp_path / "robot.xml").write_text(f"<mujoco><worldbody>{bodies}</worldbody></mujoco>")
+    model = visual_model(replace(load_robot("go2"), mjcf=tmp_path / "robot.xml"), make_terrain("flat"), PLAIN)
+    assert {int(model.geom_group[g]) for g in range(model.ngeom) if model.geom_bodyid[g]} == groups
