@@ -161,10 +161,16 @@ def backend_class(name: str) -> type[PhysicsBackend]:
                 gave = shown(type(found).__name__)
                 raise BackendError(f"{origin(plugin)} gave {gave}; it must be a subclass of PhysicsBackend")
             guarded(plugin, BackendError, found.capabilities)
-    except ImportError as error:
+    except ModuleNotFoundError as error:
         command = _install(engine, (error.name or "",))
         missing = f"needs the package '{error.name}', which is not installed: {command}"
         raise BackendError(f"backend '{name}' {missing}") from error
+    except (ImportError, OSError) as error:  # such as a library of the system that a package was linked with
+        own = _OWN.get(engine)
+        anew = f", or the engine anew: {_install(engine, own.packages)}" if own else ""
+        raise BackendError(
+            f"backend '{name}' is installed but cannot be loaded ({one_line(error)}); install what it lacks{anew}"
+        ) from error
     return found
 
 

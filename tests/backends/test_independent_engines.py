@@ -94,3 +94,27 @@ def test_workers_start_afresh_after_physx_was_at_work_here():
         while len(said) < 2:
             said |= dict(workers.receive())
     assert all(isinstance(message, Progress) for message in said.values()), said
+
+
+@pytest.mark.parametrize(
+    ("error", "expected"),
+    [
+        (
+            ModuleNotFoundError("No module named 'pydrake'", name="pydrake"),
+            "backend 'drake' needs the package 'pydrake', which is not installed: pip install 'gaitgauge[drake]'",
+        ),
+        (
+            ImportError("libX11.so.6: cannot open shared object file", name="common"),
+            "backend 'drake' is installed but cannot be loaded (libX11.so.6: cannot open shared object file); install what it "
+            "lacks, or the engine anew: pip install 'gaitgauge[drake]'",
+        ),
+    ],
+)
+def test_a_missing_package_and_a_missing_library_are_told_apart(monkeypatch, error, expected):
+    def fails(*_):
+        raise error
+
+    monkeypatch.setattr(registry, "import_module", fails)
+    with pytest.raises(BackendError) as caught:
+        engine_class("drake")
+    assert str(caught.value) == expected
