@@ -21,9 +21,11 @@ from .progress import ProgressDisplay, duration
 from .studies import resumable
 
 
-def run_consistency(request: StudyRequest, backends: str, *, out: Path | None, resume: bool, json_output: bool) -> None:
+def run_consistency(
+    request: StudyRequest, backends: str | None, *, out: Path | None, resume: bool, json_output: bool
+) -> None:
     """Make the study, show progress, print the tables and where the files are."""
-    request = replace(request, backends=tuple(b.strip() for b in backends.split(",") if b.strip()))
+    request = replace(request, backends=() if backends is None else tuple(backends.split(",")))
     console = Terminal(stderr=True)
     prepared = prepare_study(request)  # all that can be wrong with the request is said before anything is written
     _print_skipped(console, prepared.skipped)

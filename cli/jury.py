@@ -22,10 +22,10 @@ from .progress import ProgressDisplay, duration
 from .studies import resumable, show_results
 
 
-def run_jury(request: JuryRequest, engines: str, *, out: Path | None, resume: bool, json_output: bool) -> None:
+def run_jury(request: JuryRequest, engines: str | None, *, out: Path | None, resume: bool, json_output: bool) -> None:
     """Judge policies, show progress, print the tables and where the files are."""
     usual = Path("results") / f"{joined_names(request.policies)}-jury-{request.part}"
-    names = tuple(name.strip() for name in engines.split(",") if name.strip())
+    names = () if engines is None else tuple(engines.split(","))
     request = replace(request, engines=names, policies=policy_files(request.policies))
     console = Terminal(stderr=True)
     prepared = prepare_jury(request)  # all that can be wrong with the request is said before anything is written

@@ -124,7 +124,7 @@ def validate(
 @command(app, long=True)
 def jury(
     request: JuryRequest,
-    engines: Annotated[str, Choice(_JURY, PLACE, "backends")] = "",
+    engines: Annotated[str | None, Choice(_JURY, PLACE, "backends")] = None,
     out: Annotated[Path | None, output("results/<policies>-jury-<part>")] = None,
     resume: Annotated[bool, resume("jury")] = False,
     json_output: Tables = False,
@@ -143,7 +143,7 @@ def jury(
 @command(app, long=True)
 def consistency(
     request: StudyRequest,
-    backends: Annotated[str, Choice(_ENGINES, PLACE, "backends")] = "",
+    backends: Annotated[str | None, Choice(_ENGINES, PLACE, "backends")] = None,
     out: Annotated[Path | None, output("results/<policy>-<suite>-consistency")] = None,
     resume: Annotated[bool, resume("study")] = False,
     json_output: Tables = False,

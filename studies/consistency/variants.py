@@ -88,9 +88,7 @@ def parse_variant(text: str) -> Variant:
     """
     backend, *changes = text.strip().split("@")
     if not backend:
-        raise ConsistencyError(
-            f"{shown(text)} names no engine; write for example mujoco or mujoco@timestep=0.005 (--backends)"
-        )
+        raise ConsistencyError(f"{shown(text)} names no engine; write for example mujoco or mujoco@timestep=0.005")
     hints = get_type_hints(PhysicsOptions, include_extras=True)
     free = [f.name for f in fields(PhysicsOptions) if f.name not in ("substeps", "watch_tilt", "watch_penetration")]
     overrides: dict[str, Value] = {}

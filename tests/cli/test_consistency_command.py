@@ -102,6 +102,8 @@ def test_an_engine_that_is_left_out_is_told(run, tmp_path, policy, tiny, monkeyp
 def test_bad_input_is_one_sentence(refused, policy, tmp_path):
     out = ("--out", tmp_path / "none")
     assert "two engines" in refused("consistency", policy, "--backends", "mujoco", *out)
+    for command, option in (("consistency", "--backends"), ("jury", "--engines")):
+        assert "'' names no engine" in refused(command, policy, option, "", *out)
     assert "unknown backend 'nonsense'" in refused("consistency", policy, "--backends", "mujoco,nonsense", *out)
     assert "@option=value" in refused("consistency", policy, "--backends", "mujoco,mujoco@speed=1", *out)
     assert "--seeds" in refused("consistency", policy, "--backends", "mujoco,mujoco@cone=pyramidal", "--seeds", 1, *out)
