@@ -70,8 +70,11 @@ def make_bench(backend: str | type[PhysicsBackend], device: str = "cpu", *, robo
         robot: the robot in the scenes, four-legged with spherical feet; None for the Go2.
 
     Raises:
-        BackendError: the engine is unknown or not installed, or does not declare all capabilities.
+        BackendError: the engine is unknown or not installed, or does not declare all capabilities, or the robot has not four feet.
     """
+    if robot is not None and len(robot.foot_names) != 4:
+        told = f"robot '{robot.name}' has {len(robot.foot_names)} feet, and conformance takes one that stands on four"
+        raise BackendError(f"{told}; leave robot out: the checks named soles/ bring a robot of two legs")
     name = backend if isinstance(backend, str) else backend.name
     found = engine_class(name) if isinstance(backend, str) else backend
     capabilities = found.capabilities()

@@ -8,6 +8,7 @@ import torch
 from gaitgauge.backends import BackendError, PhysicsBackend
 from gaitgauge.backends.base import CAPABILITY_NAMES
 from gaitgauge.backends.conformance import Outcome, all_checks, make_bench, run_check, run_conformance
+from gaitgauge.robots import load_robot
 from gaitgauge_fake_engine import FakeBackend
 
 CHECKS = {check.name: check for check in all_checks()}
@@ -81,6 +82,8 @@ def test_unknown_check_and_engine_are_refused():
         run_conformance("fake", only=["contakt"])
     with pytest.raises(BackendError, match="unknown backend 'havok'"):
         run_conformance("havok")
+    with pytest.raises(BackendError, match="robot 'g1' has 2 feet, and conformance takes one that stands on four"):
+        run_conformance("fake", robot=load_robot("g1"))
 
 
 def test_undeclared_capabilities_are_refused():
