@@ -256,7 +256,7 @@ def check_robot(contract: PolicyContract, robot: Robot) -> tuple[int, ...]:
 
     Raises:
         ContractError: another robot, or joint names that are not, in some order, those of the robot or of one of its variants, and that
-            do not make them up with the joints that the policy holds.
+            do not make them up with the joints that the policy holds, or a target of angle without stiffness.
     """
     if contract.robot != robot.name:
         raise ContractError(
@@ -280,7 +280,15 @@ def check_robot(contract: PolicyContract, robot: Robot) -> tuple[int, ...]:
             f"the policy gives targets of velocity to {ours}, robot '{robot.name}' takes them for {theirs}; mend velocity_joints of "
             "the policy's contract"
         )
-    return tuple(robot.joint_names.index(n) for n in contract.joint_names)
+    own = robot.parameters[robot.default_parameters].stiffness
+    index = tuple(robot.joint_names.index(n) for n in contract.joint_names)
+    for name, stiffness, i in zip(contract.joint_names, contract.stiffness, index, strict=True):
+        if stiffness == 0.0 and own[i] > 0.0:
+            raise ContractError(
+                f"the policy's stiffness of '{name}' is 0, so that its target of angle moves nothing; give its kp, or a robot with "
+                "wheels there (velocity_joints)"
+            )
+    return index
 
 
 def held_joints(contract: PolicyContract, robot: Robot) -> tuple[HeldJoint, ...]:

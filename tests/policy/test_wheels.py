@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import yaml
 from gaitgauge.policy.base import PolicyError
-from gaitgauge.policy.contract import standard_contract
+from gaitgauge.policy.contract import ContractError, check_robot, standard_contract
 from gaitgauge.policy.export.files import ExportError, deploy_settings
 from gaitgauge.policy.foreign.deploy_yaml import read_deploy
 from gaitgauge.policy.foreign.described import described_contract, template
@@ -72,6 +72,16 @@ def test_lists_of_the_legs_alone_get_the_robots_own_wheels():
     settings["actions"]["JointVelocityAction"]["joint_ids"] = [12, 13, 14]
     with pytest.raises(PolicyError, match=r"every number from 0 to 15 is needed once for robot 'go2w'"):
         read_deploy(settings, Path("deploy.yaml"), GO2W)
+
+
+def test_wheels_that_are_taken_for_legs_are_refused():
+    """Other projects give wheels a stiffness of zero; as targets of angle their actions would move nothing."""
+    legs = replace(standard_contract(GO2), stiffness=(0.0, *(20.0,) * 11))
+    with pytest.raises(
+        ContractError, match="stiffness of 'FL_hip_joint' is 0, so that its target of angle moves nothing"
+    ):
+        check_robot(legs, GO2)
+    check_robot(standard_contract(GO2W), GO2W)
 
 
 def test_a_contract_that_is_written_for_a_robot_with_wheels_names_them(tmp_path):
