@@ -24,7 +24,7 @@ from ...gauge.plan import Records
 from ...gauge.play.progress import Status
 from ...gauge.play.remaining import Cost
 from ...gauge.play.workers import WorkerError
-from ...gauge.store import RunFolder, StoreError
+from ...gauge.store import RunFolder, StoreError, check_folder
 from ...gauge.suite import Suite, load_suite
 from ...robots import Robot
 from ...robots.loading import robot_digest
@@ -168,6 +168,8 @@ def jury(
     """
     began = time.perf_counter()
     prepared = request if isinstance(request, PreparedJury) else prepare_jury(request)
+    for name, identity in prepared.runs:  # before the engines' speeds are measured, which takes long
+        check_folder(folder / name, identity, resume=resume)
     torch.set_num_threads(1)  # several would change the last bits of the policy's output
     session = _Session(prepared, folder, resume=resume, watch=watch, told=told)
     blocks = [session.judge(label, loaded) for label, loaded in prepared.policies.items()]

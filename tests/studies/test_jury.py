@@ -9,6 +9,7 @@ import pytest
 import torch
 from gaitgauge.backends import BackendError
 from gaitgauge.gauge.episodes import Record
+from gaitgauge.gauge.store import StoreError
 from gaitgauge.gauge.suite import load_suite
 from gaitgauge.policy.contract import standard_contract
 from gaitgauge.policy.native import StoredNetwork, save_policy
@@ -121,6 +122,10 @@ def test_a_jury_goes_on_where_it_stopped(brief, tmp_path):
     again = judged(brief, tmp_path / "out", resume=True)
     assert {p: p.stat().st_mtime_ns for p in files[1:]} == times
     assert again["policies"] == first["policies"]
+    told = []
+    with pytest.raises(StoreError, match="already holds this run; go on with --resume"):
+        judged(brief, tmp_path / "out", told=told.append)
+    assert told == []  # no speed was measured for it
 
 
 def test_an_engine_that_fails_is_named_and_the_others_judge(brief, tmp_path):
