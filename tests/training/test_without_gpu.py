@@ -32,7 +32,7 @@ def test_each_part_of_the_refusal():
         "task 'go2-flat' trains on mujoco-warp, which wants an NVIDIA GPU, and this machine has none; "
     )
     assert "'gaitgauge train toy' learns to walk here in about" in said
-    assert "first_training.ipynb trains go2-flat on a hosted GPU" in said
+    assert "the repository's docs/start/first_training.ipynb trains go2-flat on a hosted GPU" in said
     assert said.endswith("--backend mujoco trains this task here in about 14 h")  # 380 x 24 x 8192 / 1450 s
 
 

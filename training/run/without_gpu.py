@@ -31,8 +31,8 @@ def check_gpu(request: TrainRequest) -> None:
     cores = cpu_threads(None)
     raise DeviceError(
         f"task '{task.name}' trains on {backend}, which wants an NVIDIA GPU, and this machine has none",
-        f"'gaitgauge train toy' learns to walk here in {_time(_TOY, _TOY_TIMES, cores)}, docs/start/first_training.ipynb "
-        f"trains go2-flat on a hosted GPU, and --backend mujoco trains this task here in "
+        f"'gaitgauge train toy' learns to walk here in {_time(_TOY, _TOY_TIMES, cores)}, the repository's "
+        f"docs/start/first_training.ipynb trains go2-flat on a hosted GPU, and --backend mujoco trains this task here in "
         f"{_time(task, _TIMES, cores)}",
     )
 
