@@ -152,7 +152,7 @@ def print_results(console: Terminal, result: Result) -> None:
     if troubles:
         episodes = "quality episode" if health.episodes == 1 else "quality episodes"
         console.say(f"in {health.episodes} {episodes}: {', '.join(troubles)}")
-    if falls_at_limit(result.environments, health):
+    if falls_at_limit(result.environments):
         console.say(FELL_AT_LIMIT)
 
 

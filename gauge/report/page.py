@@ -36,9 +36,9 @@ _LONGEST = 400
 _DIVERGED = "The simulation became invalid there; each counts as a fall. The engine or its settings may be at fault."
 _DROPPED = "The engine had no room for all contacts or constraints there, so these values are not exact."
 _FELL = "The robot tilted beyond the suite's limit; the suite says what that ends and what it costs."
-FELL_AT_LIMIT = "Quality is measured at the highest level that the policy passes, where it is at its limit; the score counts the fall."
+FELL_AT_LIMIT = "Quality is measured at the highest level that the policy passes, where it is at its limit; the score counts every fall."
 _MANY_FALLS = 0.5
-"""Falls for each quality episode above which falls at the policy's own limit are grave, too."""
+"""Share of environments with falls above which falls at the policy's own limit are grave, too."""
 _TOUCHED = "Legs that strike each other can break on a robot; episodes.csv says at which commands."
 _LITTLE_CONTACT = 0.01
 """Share of the samples below which contact of the robot with itself takes one line."""
@@ -163,7 +163,7 @@ def warnings(rows: Sequence[EnvironmentRow], health: Health, remarks: Sequence[s
     share = health.self_contact or 0.0
     touching = f"parts of the robot touch each other in {_percent(share)} of the samples"
     touch = "slight" if share < _LITTLE_CONTACT else "note"
-    at_limit = falls_at_limit(rows, health)
+    at_limit = falls_at_limit(rows)
     fall, fell = ("note", FELL_AT_LIMIT) if at_limit else ("grave", _FELL)
     kinds = [
         (health.diverged, "grave", f"physics diverged in {health.diverged} of {total}", _DIVERGED, "diverged"),
@@ -187,10 +187,10 @@ def warnings(rows: Sequence[EnvironmentRow], health: Health, remarks: Sequence[s
     return sorted(found, key=lambda w: ("grave", "note", "slight").index(w["severity"]))
 
 
-def falls_at_limit(rows: Sequence[EnvironmentRow], health: Health) -> bool:
-    """Return whether all falls of a run happened at levels that were searched for, and not in more than half of its episodes."""
-    elsewhere = any(r.falls and r.search is None for r in rows)
-    return 0 < health.falls <= _MANY_FALLS * health.episodes and not elsewhere
+def falls_at_limit(rows: Sequence[EnvironmentRow]) -> bool:
+    """Return whether all falls happened at levels that were searched for, and not in more than half of the environments."""
+    fell = [r for r in rows if r.falls]
+    return 0 < len(fell) <= _MANY_FALLS * len(rows) and all(r.search is not None for r in fell)
 
 
 def _places(rows: Sequence[EnvironmentRow], key: str | None) -> list[str]:
