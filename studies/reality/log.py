@@ -19,6 +19,8 @@ MOST_BAD = 0.2
 """Largest share of rows that may be dropped; beyond it a log is refused."""
 LONGEST_GAP = 0.5
 """Longest time without a row [s]."""
+_APART = 0.06
+"""Time over which velocities are added up before they are held against positions [s]: noise of positions counts less."""
 _MOVING = 0.2
 """RMS velocity [rad/s] from which a joint's recorded velocities are held against its positions."""
 _SPIKE = 0.25
@@ -239,7 +241,7 @@ def _check_velocity(log: Log, source: str) -> None:
     """Refuse velocities that are not the change of their positions: degrees, a wrong sign, columns under the wrong name."""
     if log.velocity is None:
         return
-    every = max(round(0.02 / log.period), 1)
+    every = max(round(_APART / log.period), 1)
     time, position = log.time[::every], log.position[::every]
     area = np.zeros_like(log.velocity)
     np.cumsum((log.velocity[1:] + log.velocity[:-1]) / 2 * np.diff(log.time)[:, None], axis=0, out=area[1:])

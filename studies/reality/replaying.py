@@ -25,6 +25,10 @@ from .request import LogOptions, ReplayRequest
 from .residuals import differences, noise, repeatability, summarize
 from .rig import FixedRig, Motion, acting_parameters, at_rows, beginning, held_targets, num_steps, play
 
+_SMOOTHED = 0.1
+"""Length of the windows in which series are smoothed before torques are held against gains [s]."""
+_MOVES = 0.02
+"""Least standard deviation of a target at which its joint's torques are held against its gains [rad]."""
 LONGEST_DELAY = 0.03
 """Largest delay that is fitted [s]."""
 _CARRIED = 0.4
@@ -168,25 +172,33 @@ def check_torque(log: Log) -> None:
     """Refuse a log if its recorded torques follow other gains than the gains that it states.
 
     Raises:
-        LogError: the median over the joints of the acting share of kp is below 0.5 or above 1.6.
+        LogError: all torques are 0, or the median over the moving joints of the acting share of kp is below 0.5 or above 1.6.
     """
     if log.torque is None:
         return
     if not log.torque.any():
         raise LogError(f"log '{log.name}' has torques of 0 in every row; leave them out, or record the motors' own")
+    moving = np.flatnonzero(log.target.std(axis=0) > _MOVES)
+    if not len(moving):
+        return
+    from scipy.signal import savgol_filter
+
+    window = max(2 * round(_SMOOTHED / log.period / 2) + 1, 5)
+    target, position, torque = (savgol_filter(one, window, 3, axis=0) for one in (log.target, log.position, log.torque))
+    # of positions: the noise of recorded speeds, times a high kd, would make kp look small
+    speed = savgol_filter(log.position, window, 3, deriv=1, delta=log.period, axis=0)
     slopes = []
-    speed = log.velocity if log.velocity is not None else np.gradient(log.position, log.time, axis=0)
     for lag in range(8):
         rows = slice(lag, None), slice(None, len(log.time) - lag)
-        error = log.target[rows[1]] - log.position[rows[0]]
+        error = target[rows[1]] - position[rows[0]]
         found = []
-        for j in range(log.target.shape[1]):
+        for j in moving:
             columns = np.stack([error[:, j], -speed[rows[0]][:, j], np.ones(len(error))], axis=1)
-            solution, residual, *_ = np.linalg.lstsq(columns, log.torque[rows[0]][:, j], rcond=None)
+            solution, residual, *_ = np.linalg.lstsq(columns, torque[rows[0]][:, j], rcond=None)
             found.append((float(residual[0]) if len(residual) else np.inf, solution[0]))
         slopes.append((sum(r for r, _ in found), [float(s) for _, s in found]))
     followed = np.array(min(slopes)[1])
-    if not 0.5 <= float(np.median(followed / log.stiffness.clip(1e-9))) <= 1.6:
+    if not 0.5 <= float(np.median(followed / log.stiffness[moving].clip(1e-9))) <= 1.6:
         raise LogError(
             f"log '{log.name}' says that kp was {np.median(log.stiffness):g} N·m/rad, but its torques follow {np.median(followed):.3g}; "
             "correct the gains (stiffness and damping in --map)"

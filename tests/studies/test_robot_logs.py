@@ -238,6 +238,11 @@ def test_legs_of_a_standing_robot_carry_its_weight():
 
 def test_gains_that_the_torques_contradict_are_refused(log):
     check_torque(log)
+    check_torque(replace(log, target=np.tile(log.target[0], (len(log.time), 1))))  # nothing moves
+    stiff = simulated_log(
+        GO2, GO2.parameters["gauge"], chirp=Chirp(seconds=2.0, last=2.0), damping=5.0, noise=(2e-3, 0.2, 0.1)
+    )
+    check_torque(stiff)  # noise of speeds is not taken for a low kp
     with pytest.raises(LogError, match=r"says that kp was 60 N·m/rad, but its torques follow 2\d"):
         check_torque(replace(log, stiffness=np.full(12, 60.0)))
     with pytest.raises(LogError, match="kp was 0 N·m/rad, but its torques follow 2"):
