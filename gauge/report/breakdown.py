@@ -4,9 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from statistics import fmean
+from types import MappingProxyType
 
+import numpy as np
+
+from ..commands import Phase
 from ..goals import SUB_COMMANDS, TARGET, command_name
-from ..result import EnvironmentRow
+from ..result import EnvironmentRow, Result
+from ..suite import load_suite, suite_names
 
 DIRECTIONS: Mapping[str, tuple[int, int]] = {
     "forward": (0, 1),
@@ -23,8 +28,25 @@ Table = Mapping[str, Mapping[str, float]]
 """Mean of quality by label and terrain; ``mean`` is the first of them."""
 
 
-def command_label(name: str) -> str:
-    """Return a sub-command for readers: ``max_velocity +x`` is ``full speed, then stop: forward``; others go by their names."""
+Parts = Mapping[str, Sequence[Phase]]
+"""Phases of the sub-commands of a suite's own goals, by name."""
+
+
+def own_parts(result: Result) -> Parts:
+    """Return the sub-commands of the goals of a result's suite; empty where that does not ship or has changed since."""
+    suite = load_suite(result.suite.name) if result.suite.name in suite_names() else None
+    if suite is None or suite.digest != result.suite.digest:
+        return {}
+    return {command_name(goal.name, i): part for goal in suite.goals for i, part in enumerate(goal.sub_commands)}
+
+
+def command_label(name: str, own: Parts = MappingProxyType({})) -> str:
+    """Return a sub-command for readers: ``max_velocity +x`` is ``full speed, then stop: forward``.
+
+    One of ``own`` is told by its phases, in shares of the command limits; others go by their names.
+    """
+    if name in own:
+        return f"{name.rpartition(' ')[0]}: {', then '.join(_told(phase) for phase in own[name])}".replace("_", " ")
     known = {
         command_name(goal, part): (goal, part) for goal, parts in SUB_COMMANDS.items() for part in range(len(parts))
     }
@@ -35,8 +57,21 @@ def command_label(name: str) -> str:
     return f"{_GOALS[goal]}: {' and '.join(towards)}" if towards else _GOALS[goal]
 
 
-def breakdown(rows: Sequence[EnvironmentRow]) -> dict[str, Table]:
+def _told(phase: Phase) -> str:
+    """Return a phase in words: ``0.5 forward and 0.7 turning left``."""
+    towards = [
+        label if abs(speed) == 1.0 else f"{abs(speed):g} {label}"
+        for label, (axis, sign) in DIRECTIONS.items()
+        if (speed := phase.velocity[axis]) * sign > 0.0
+    ]
+    return " and ".join(towards) or "standing"
+
+
+def breakdown(rows: Sequence[EnvironmentRow], own: Parts = MappingProxyType({})) -> dict[str, Table]:
     """Return quality (mean@50) as measured, at the levels reached: the mean over a terrain's environments and seeds.
+
+    Args:
+        own: sub-commands of the suite's own goals; one goes where its first phase goes.
 
     Returns:
         ``direction``: of all sub-commands that go there, ``command``: of each sub-command. Empty where none was recorded.
@@ -49,13 +84,16 @@ def breakdown(rows: Sequence[EnvironmentRow]) -> dict[str, Table]:
     if not values:
         return {}
     directions: dict[str, dict[str, list[float]]] = {}
-    for goal, parts in SUB_COMMANDS.items():
-        for part, signs in enumerate(parts):
-            for label, place in DIRECTIONS.items():
-                if _points(signs, place):
-                    for terrain, found in values.get(command_name(goal, part), {}).items():
-                        directions.setdefault(label, {}).setdefault(terrain, []).extend(found)
-    named = {command_label(name): by_terrain for name, by_terrain in values.items()}
+    first = {command_name(goal, i): signs for goal, parts in SUB_COMMANDS.items() for i, signs in enumerate(parts)}
+    for name, part in own.items():
+        forward, lateral, yaw = np.sign(part[0].velocity)
+        first[name] = int(forward), int(lateral), int(yaw)
+    for name, signs in first.items():
+        for label, place in DIRECTIONS.items():
+            if _points(signs, place):
+                for terrain, found in values.get(name, {}).items():
+                    directions.setdefault(label, {}).setdefault(terrain, []).extend(found)
+    named = {command_label(name, own): by_terrain for name, by_terrain in values.items()}
     ordered = {label: directions[label] for label in DIRECTIONS if label in directions}
     return {"direction": _means(ordered), "command": _means(named)}
 

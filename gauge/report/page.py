@@ -17,7 +17,7 @@ from ..result_figures import check_figures
 from ..scoring import STATISTICS
 from ..store import StoreError
 from . import charts
-from .breakdown import breakdown
+from .breakdown import breakdown, own_parts
 from .charts import number, terrain_label
 from .pages import page_of, page_template
 from .references import comparable, references_for
@@ -128,7 +128,7 @@ def report_data(result: Result) -> dict[str, Any]:
         "score_figures": _figures(rows, "score", both) if evaluated else [],
         "metric_strips": {name: _strip(row) for name, row in result.metrics.items()},
         "metric_matrix": metric_matrix(rows),
-        "breakdown": breakdown(rows),
+        "breakdown": breakdown(rows, own_parts(result)),
         "references": [
             {"of": r, "strip": charts.strip({"mean50": r.score}, r.interval, [result.score])}
             for r in references

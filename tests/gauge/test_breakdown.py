@@ -4,7 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from gaitgauge.gauge.report.breakdown import breakdown, command_label
+from gaitgauge.gauge.report.breakdown import breakdown, command_label, own_parts
 from gaitgauge.gauge.report.references import comparable, reference_table, references_for
 from gaitgauge.gauge.result import Coverage, Run, read_result
 from gaitgauge.gauge.store import StoreError
@@ -43,6 +43,26 @@ def test_labels_of_commands():
     assert command_label("max_velocity -yaw") == "full speed, then stop: turning right"
     assert command_label("target_pos_velocity") == "to the target"
     assert command_label("own_goal +z") == "own goal +z"
+
+
+def test_commands_of_a_suite_s_own_goals_are_told():
+    result = sample()
+    suite = load_suite("gaitgauge-biped-1")
+    of = replace(result.suite, name=suite.name, digest=suite.digest)
+    parts = own_parts(replace(result, suite=of))
+    assert command_label("walk 3", parts) == "walk: 0.5 backward, then standing"
+    assert (
+        command_label("turn 1", parts)
+        == "turn: 0.7 forward and 0.7 turning left, then 0.7 forward and 0.7 turning right"
+    )
+    found = breakdown([row("flat", {"walk 1": 0.8, "turn 1": 0.4, "walk 4": 0.2})], parts)
+    assert found["direction"]["forward"]["flat"] == pytest.approx(0.6) and list(found["direction"]) == [
+        "forward",
+        "left",
+        "turning left",
+    ]
+    assert next(iter(found["command"])) == "walk: forward, then standing"
+    assert own_parts(replace(result, suite=replace(of, digest="0" * 64))) == {}, "other rules"
 
 
 def result(suite="robogauge-1.1", version="1.1.0", kind="complete", score=0.6, sha="ab", **other):
