@@ -79,5 +79,5 @@ def comparable(result: Result) -> str:
     if others:
         both = [*here, others[0]] if result.backend == ENGINE else others[:1]
         told = " and ".join(f"{r.score:.4f} on {r.suite} {r.version}" for r in both)
-        example = f"; other suites have other scales: pretrained has {told}"
+        example = f"; other suites have other scales: {both[0].policy.partition(',')[0]} has {told}"
     return f"this score compares only with scores of {scale}{example}"
