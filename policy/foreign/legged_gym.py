@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ...robots.base import Robot
+from ...robots.anatomy.body_plan import body_plan
+from ...robots.base import HeldJoint, Robot
 from ..base import PolicyError
 from ..contract import History, ObservationTerm, PolicyContract
 from .bodies import choose_robot, sdk_joints
@@ -26,9 +27,9 @@ def read_legged_gym(data: Mapping[str, Any], path: Path, asked: Robot | None) ->
     """Return the contract that the settings describe.
 
     A frame is turning speed, gravity, command, joint positions, joint speeds, last action, and with two more entries sine and
-    cosine of a gait clock of 0.8 s. ``leg_joint2motor_idx`` gives the motor of each of the policy's joints; without it the joints
-    are in the robot's order. Some such files write the default angles by motor; the order that is nearer to the standing pose
-    counts.
+    cosine of a gait clock of 0.8 s. As many actions as joints of the legs drive these; others are held.
+    ``leg_joint2motor_idx`` gives the motor of each of the policy's joints; without it the joints are in the robot's order. Some such
+    files write the default angles by motor; the order that is nearer to the standing pose counts.
 
     Raises:
         PolicyError: the file is malformed, is for another robot, or its width is that of another observation.
@@ -42,11 +43,9 @@ def read_legged_gym(data: Mapping[str, Any], path: Path, asked: Robot | None) ->
 
 def _read(data: Mapping[str, Any], path: Path, robot: Robot) -> PolicyContract:
     motors, joints = data.get("leg_joint2motor_idx"), int(data["num_actions"])
-    if joints != robot.num_joints:
-        raise PolicyError(
-            f"'{path}' has {joints} actions and robot '{robot.name}' {robot.num_joints} joints; give another robot's robot.toml (--robot)"
-        )
-    names = robot.joint_names if motors is None else sdk_joints(robot, list(motors), path, "leg_joint2motor_idx")
+    names, held = _driven(robot, joints, path)
+    if motors is not None:
+        names = sdk_joints(robot, list(motors), path, "leg_joint2motor_idx")
     frame = 9 + 3 * joints
     width = int(data["num_obs"])
     frames, rest = divmod(width, frame)
@@ -56,6 +55,7 @@ def _read(data: Mapping[str, Any], path: Path, robot: Robot) -> PolicyContract:
             "contract.toml that describes its observation (gaitgauge contract new)"
         )
     assumed = ["the observation of unitree_rl_gym's controller"]
+    assumed += [f"the {len(held)} joints of robot '{robot.name}' beside its legs are held"] if held else []
     standing = dict(zip(robot.joint_names, robot.default_joint_position, strict=True))
     angles = [float(v) for v in data["default_angles"]]
     gains: tuple[Any, ...] = (data["kps"], data["kds"])
@@ -95,5 +95,25 @@ def _read(data: Mapping[str, Any], path: Path, robot: Robot) -> PolicyContract:
         observation=tuple(terms),
         history=History(length=max(frames, 1)),
         command_limits=(forward, sideways, turning),
+        held=held,
         provenance={"adapter": "unitree_rl_gym settings", "file": path.name, "assumed": ", ".join(assumed)},
     )
+
+
+def _driven(robot: Robot, joints: int, path: Path) -> tuple[Sequence[str], tuple[HeldJoint, ...]]:
+    """Return the joints of a policy of so many actions, in the robot's order, and those that are held: all, or those of its legs."""
+    legs = sorted(joint for leg in body_plan(robot).legs for joint in leg)
+    if joints not in (robot.num_joints, len(legs)):
+        raise PolicyError(
+            f"'{path}' has {joints} actions and robot '{robot.name}' {robot.num_joints} joints, {len(legs)} of them in its legs; give "
+            "another robot's robot.toml (--robot)"
+        )
+    if joints == robot.num_joints:
+        return robot.joint_names, ()
+    motors, pose, names = robot.parameters[robot.default_parameters], robot.default_joint_position, robot.joint_names
+    rest = [j for j in range(robot.num_joints) if j not in legs]
+    held = (
+        HeldJoint(name=names[j], position=pose[j], stiffness=motors.stiffness[j], damping=motors.damping[j])
+        for j in rest
+    )
+    return [names[j] for j in legs], tuple(held)

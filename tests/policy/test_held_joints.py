@@ -1,6 +1,7 @@
 """Joints that a policy does not drive: its contract or its robot holds them at a pose, with gains."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -8,7 +9,10 @@ from gaitgauge.backends.base import PhysicsState
 from gaitgauge.backends.conformance.soles import two_soles
 from gaitgauge.gauge.motors import joint_parameters
 from gaitgauge.gauge.suite import load_suite
+from gaitgauge.policy.base import PolicyError
 from gaitgauge.policy.contract import ContractError, PolicyContract, held_joints, reordered, standard_contract
+from gaitgauge.policy.foreign.legged_gym import read_legged_gym
+from gaitgauge.policy.foreign.zoo import known_contract, zoo
 from gaitgauge.policy.observation import ObservationBuilder
 from gaitgauge.robots.base import HeldJoint
 
@@ -70,3 +74,23 @@ def test_wrong_joints_are_refused():
         ObservationBuilder(without_knees(held=KNEES[:1]), ROBOT, 1)
     with pytest.raises(ContractError, match="held names 'left_hip', which is in joint_names too or held twice"):
         without_knees(held=(*KNEES, replace(KNEES[0], name="left_hip")))
+
+
+def test_unitree_rl_gyms_g1_is_run_as_the_zoo_says():
+    """Its ``g1.yaml`` drives the legs of a robot with arms; the zoo's contract of the same policy was written by hand."""
+    known = next(each for each in zoo().values() if each.name == "unitree_rl_gym-g1")
+    settings = {
+        "default_angles": [-0.1, 0.0, 0.0, 0.3, -0.2, 0.0] * 2, "kps": [100, 100, 100, 150, 40, 40] * 2,
+        "kds": [2, 2, 2, 4, 2, 2] * 2, "simulation_dt": 0.002, "control_decimation": 10, "ang_vel_scale": 0.25,
+        "dof_pos_scale": 1.0, "dof_vel_scale": 0.05, "action_scale": 0.25, "cmd_scale": [2.0, 2.0, 0.25],
+        "num_actions": 12, "num_obs": 47, "max_cmd": [0.8, 0.5, 1.0],
+    }  # fmt: skip
+    found = read_legged_gym(settings, Path("g1.yaml"), None)
+    by_hand = known_contract(known, None)
+    assert sorted(each.name for each in found.held) == sorted(each.name for each in by_hand.held)
+    assert replace(found, held=by_hand.held).hash == by_hand.hash
+    assert "the 17 joints of robot 'g1' beside its legs are held" in found.provenance["assumed"]
+    with pytest.raises(
+        PolicyError, match="has 11 actions and robot 'g1' 29 joints, 12 of them in its legs; give another"
+    ):
+        read_legged_gym(settings | {"num_actions": 11}, Path("g1.yaml"), None)
