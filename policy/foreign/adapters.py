@@ -71,12 +71,12 @@ def assumptions(contract: PolicyContract) -> str | None:
 def described(contract: PolicyContract) -> str | None:
     """Return where a policy's description was read, and what was assumed, for a sentence that begins with the policy's name.
 
-    None for a contract of the project's own, or one that was written by hand and leaves nothing open.
+    None for a contract of the project's own, or of a policy that was imported with one that leaves nothing open.
     """
     assumed, adapter = assumptions(contract), contract.provenance.get("adapter")
     if adapter in GUESSES:
         return f"does not say how it is to be run; {assumed}"
-    if adapter is None or (adapter == "contract.toml" and assumed is None):
+    if adapter is None or (adapter == "contract.toml" and assumed is None and "imported_from" in contract.provenance):
         return None
     file = contract.provenance.get("file")
     if adapter == "zoo" or adapter.startswith("preset "):

@@ -424,7 +424,9 @@ def test_a_checkpoint_that_a_contract_describes(tmp_path):
             '"base_angular_velocity_b"', '"base_angular_velocity_b", scale = 0.2'
         ),
     )
-    check(load_policy(save(tmp_path / "model_300.pt", actor_state(module))), isaac, newest, simply(module))
+    policy = load_policy(save(tmp_path / "model_300.pt", actor_state(module)))
+    check(policy, isaac, newest, simply(module))
+    assert described_in_words(policy.contract) == "is run as 'contract.toml' says"
     save(tmp_path / "model_300.pt", actor_state(network(48)))
     with pytest.raises(
         PolicyError, match="has an actor of 48 inputs and 12 outputs; but its contract's observation has 45"
