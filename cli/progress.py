@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import threading
 import time
@@ -43,7 +44,7 @@ class ProgressDisplay:
         self._share, self._text = 0.0, "starting"
         self._left: float | None = None
         self.start = 0.0
-        """Time from the command's beginning to that of its work [s]: Python and the packages are loaded in it."""
+        """Time of a start that loads Python and the packages once more [s]; none before the work has begun."""
         self.closing = 0.0
         """Time that follows the work of which ``update`` tells the rest [s]."""
         self._memory = Remembered((), None)
@@ -56,7 +57,7 @@ class ProgressDisplay:
         first, ProgressDisplay._first = self._first, None
         if first is not None:
             self._began, self._told, self._memory = first._began, first._told, first._memory
-            self.start = self._clock() - self._began
+            self.start = _starting_again(self._clock() - self._began)
             self.closing = _CLOSING * self.start
             first.close()
             self._expect(0.0, None)
@@ -166,6 +167,12 @@ class ProgressDisplay:
             words = f"  {duration(now - self._began)}: {printable(self._words(now))}"
             head = Text.assemble((printable(self._title), "bold"), words)
             return Group(head, ProgressBar(total=1.0, completed=self._share, width=60), grid)
+
+
+def _starting_again(taken: float) -> float:
+    """Return how long another start takes: its files have been read, and the machine is as busy as now; ``taken``: the first [s]."""
+    load = os.getloadavg()[0] / (os.cpu_count() or 1) if hasattr(os, "getloadavg") else 1.0
+    return min(taken, time.process_time() * max(load, 1.0))
 
 
 def duration(seconds: float) -> str:

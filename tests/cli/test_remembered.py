@@ -92,6 +92,7 @@ def test_a_user_without_a_home_has_no_memory(monkeypatch):
 def test_a_command_shows_its_last_time_from_the_start(tmp_path, monkeypatch):
     monkeypatch.setattr("gaitgauge.cli.progress.folder_of_times", lambda: tmp_path)
     monkeypatch.setattr("sys.argv", ["gaitgauge", *LINE])
+    monkeypatch.setattr("time.process_time", lambda: 2.0)
     now, texts = 0.0, []
 
     def run(end=None):

@@ -14,7 +14,7 @@ import pytest
 import typer
 from gaitgauge.cli.console import Terminal, make_table, shell_command
 from gaitgauge.cli.errors import UserError, report_errors
-from gaitgauge.cli.progress import ProgressDisplay, duration
+from gaitgauge.cli.progress import ProgressDisplay, _starting_again, duration
 from rich.text import Text
 
 PROGRAM = "from gaitgauge.cli.main import main; main()"
@@ -97,6 +97,7 @@ def test_no_display_is_silent_while_nothing_is_heard(monkeypatch):
 def test_a_command_is_not_silent_while_it_imports_and_reads(monkeypatch):
     """Nothing was shown for 69 s on a busy machine until the first display; its clock goes on from the command's start."""
     monkeypatch.setattr("gaitgauge.cli.progress._TICK", 0.001)
+    monkeypatch.setattr("time.process_time", lambda: 18.0)
     now = 0.0
 
     def show(terminal):
@@ -113,6 +114,15 @@ def test_a_command_is_not_silent_while_it_imports_and_reads(monkeypatch):
     lines = "9 s: evaluate, starting", "18 s: evaluate, starting", "27 s: gauging, 1 of 2, about 36 s left"
     # a start of 18 s means that the page and the end take 0.6 times as long
     assert shown(show).splitlines() == [*lines, "0 s: another, 1 of 1"]
+
+
+@pytest.mark.parametrize(("load", "again"), [(0.5, 3.0), (8.0, 6.0), (80.0, 20.0)])
+def test_another_start_finds_its_files_in_memory(monkeypatch, load, again):
+    """The first one read packages for 20 s from a cold disk, of which 3 s were work; the end and the film were told too long."""
+    monkeypatch.setattr("os.getloadavg", lambda: (load, 0.0, 0.0), raising=False)
+    monkeypatch.setattr("os.cpu_count", lambda: 4)
+    monkeypatch.setattr("time.process_time", lambda: 3.0)
+    assert _starting_again(20.0) == again
 
 
 STARTED = "evaluate p|compare p q|verify c|jury p|consistency p|trial p|worst p|latent p|sweep s|replay r --robot go2"
