@@ -90,7 +90,7 @@ def test_captured_and_eager_steps_agree():
         left, right = eager._after_physics(), captured._after_physics()
         assert torch.equal(left.done, right.done), step
         assert torch.allclose(left.reward, right.reward, atol=1e-4)
-        assert torch.allclose(left.start.base_position, right.start.base_position, atol=1e-4)
+        assert torch.allclose(left.start.state.base_position, right.start.state.base_position, atol=1e-4)
         eager._reset(left.start)
         read(AFTER_RESET)
         one, two = eager._observe(), captured._observe()

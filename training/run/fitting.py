@@ -10,14 +10,18 @@ from typing import Any
 from .run_directory import update_run_json
 from .state import RunState
 
-SKIPPED, MEASURED = 10, 30
-"""Iterations done before the speed is measured, and when it is known."""
+SKIPPED, MEASURED = 10, 20
+"""Iterations at the begin of a stretch before the speed is measured, and those that are measured first."""
+EVERY = 0.1
+"""Share of the run after which the speed is measured again: robots that still fall are slower to compute."""
+CHANGE = 0.005
+"""Relative change of the length below which the schedules stay as they are."""
 SLOWER = 1.4
 """Time of an iteration in a later stretch over one in the first: its contacts cost more."""
-BUILDING = 40.0
-"""Time to build the worlds of a later stretch [s]."""
-USED = 0.97
-"""Share of the limit to fill."""
+BUILDING = 35.0
+"""Time to build the worlds of a later stretch, with kernels cached [s]."""
+SPARE = 0.025
+"""Share of the limit to leave, for the last checkpoint and what is not foreseen."""
 
 
 def iterations_that_fit(*, done: int, each: float, left: float, begins: Sequence[float]) -> int:
@@ -26,42 +30,60 @@ def iterations_that_fit(*, done: int, each: float, left: float, begins: Sequence
     Args:
         done: iterations done.
         each: time of one [s].
-        left: time that is left [s].
+        left: time to fill [s].
         begins: fractions of the run at which stretches are still to begin.
     """
     first = min(begins, default=1.0)
-    seconds = USED * left - BUILDING * len(begins)
+    seconds = left - BUILDING * len(begins)
     return max(int((done + seconds / each) / (first + SLOWER * (1.0 - first))), done + 1)
 
 
 class Fit:
-    """Measures a run's first iterations, then shortens the run and its schedules to what fits into the limit."""
+    """Measures the speed of a run again and again, and has the run and its schedules end with the limit."""
 
-    def __init__(self, run: RunState) -> None:
-        """Begin at an iteration of a run that has done none."""
-        self._run, self._begin = run, 0.0
+    def __init__(self, run: RunState, total: int, limit: float) -> None:
+        """Begin a run of at most ``total`` iterations that has ``limit`` seconds."""
+        env: Any = run.env
+        self._run, self._longest, self._spare = run, total, SPARE * limit
+        self._first = self._stretch = env.stretch
+        self._from, self._until, self._begin = SKIPPED, SKIPPED + MEASURED, 0.0
 
     def total(self, total: int, left: float) -> int:
         """Return the iterations of the whole run, in all processes alike, after an iteration with ``left`` seconds of the limit."""
         run, now = self._run, time.monotonic()
-        if run.iteration == SKIPPED:
-            self._begin = now
-        if run.iteration != MEASURED:
-            return total
         env: Any = run.env
-        each = (now - self._begin) / (MEASURED - SKIPPED)
-        begins = [stretch.begin for stretch in env.cfg.schedule.stretches[env.stretch :] if stretch.begin < 1.0]
-        fitting = iterations_that_fit(done=run.iteration, each=each, left=left, begins=begins)
-        fitted: int = min(run.processes.firsts(fitting), total)
-        if fitted == total:
-            run.message(f"All {total} iterations fit into the time.")
+        if env.stretch != self._stretch:
+            self._stretch, self._from = env.stretch, run.iteration + SKIPPED
+            self._until = self._from + MEASURED
+        if run.iteration == self._from:
+            self._begin = now
+        if run.iteration != self._until:
             return total
-        steps = fitted * run.configuration.run.steps_per_iteration
+        each = (now - self._begin) / (self._until - self._from)
+        stretches = env.cfg.schedule.stretches
+        begins = [stretch.begin for stretch in stretches[env.stretch :] if stretch.begin < 1.0]
+        fitting = iterations_that_fit(done=run.iteration, each=each, left=left - self._spare, begins=begins)
+        if env.stretch > self._first:  # one that has begun must not lie ahead again
+            fitting = min(fitting, int(run.iteration / stretches[env.stretch - 1].begin))
+        fitted = min(run.processes.firsts(fitting), self._longest)
+        self._from, self._until, self._begin = run.iteration, run.iteration + max(round(EVERY * fitted), MEASURED), now
+        if abs(fitted - total) > CHANGE * total:
+            total = fitted
+            self._spread(total)
+            run.message(
+                f"{total} iterations of {self._longest} fit into the time, {each:.2f} s each now: schedules end with them."
+            )
+        elif run.iteration == SKIPPED + MEASURED:
+            run.message(f"All {total} iterations fit into the time.")
+        return total
+
+    def _spread(self, iterations: int) -> None:
+        """Let all schedules, here and in the run's files, end with a number of iterations."""
+        run, steps = self._run, iterations * self._run.configuration.run.steps_per_iteration
+        env: Any = run.env
         env.set_horizon(steps)
         run.settings = copy.deepcopy(run.settings)
-        run.settings["training"]["run"]["iterations"] = fitted
+        run.settings["training"]["run"]["iterations"] = iterations
         run.settings["environment"]["schedule"]["horizon_steps"] = steps
         if run.log_dir is not None and run.processes.rank == 0:
             update_run_json(run.log_dir, {"settings": run.settings})
-        run.message(f"{fitted} iterations of {total} fit into the time, {each:.2f} s each: schedules end with them.")
-        return fitted

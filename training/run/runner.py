@@ -69,7 +69,7 @@ class TrainingRunner(RunState):
 
         Args:
             max_seconds: stop in an orderly way after this wall-clock time [s], None for no limit.
-            fit: shorten a new run to the iterations that fit into ``max_seconds``, with all of its schedules.
+            fit: shorten a new run, with all of its schedules, so that it ends with ``max_seconds``.
 
         Returns:
             How it ended. A checkpoint has been written.
@@ -83,7 +83,7 @@ class TrainingRunner(RunState):
         begin = time.monotonic()
         obs = self._begin()
         total, reason, written = self.iteration + iterations, "finished", None
-        fitted = Fit(self) if fit and max_seconds is not None else None
+        fitted = Fit(self, total, max_seconds) if fit and max_seconds is not None else None
         with StopSignals(self.message) as signals:
             try:
                 while self.iteration < total:
