@@ -39,6 +39,14 @@ def test_the_next_run_of_a_line_corrects_its_estimates(after):
     assert again.left(141.0, 0.2, 60.0) == pytest.approx(60.0)  # less done than before: the furthest counts
 
 
+def test_what_follows_the_work_is_remembered_too(tmp_path):
+    """Tables and a page of 20 s, of which the estimate said 2 s."""
+    memory = Remembered(LINE, tmp_path)
+    memory.left(80.0, 1.0, 2.0)
+    memory.keep(100.0)
+    assert Remembered(LINE, tmp_path).left(70.0, 1.0, 2.5) == pytest.approx(25.0)
+
+
 @pytest.mark.parametrize("line", [("evaluate", "q.pt"), ("evaluate", "p.pt", "--suite", "demo"), (*LINE, "--resume")])
 def test_other_lines_and_runs_that_go_on_are_not_corrected(after, line):
     again = after(*LINE)(*line)
