@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from ...robots import JointParameters
 from ...robots.sets import joint_groups
 from .log import Array, Log, LogError
-from .residuals import BLOCK, SETTLING, Squares, differences
-from .rig import FixedRig, Motion, acting_parameters, at_rows, beginning, held_targets, num_steps
+from .residuals import BLOCK, SETTLING
+from .rig import FixedRig, acting_parameters, at_rows, beginning, held_targets, num_steps
 
 _ROWS_PER_SECOND = 100.0
 """Rows of a log that are compared [1/s]; neighbouring rows of faster logs say the same."""
@@ -28,6 +28,8 @@ _TORQUE_WEIGHT = 0.5
 _LEVEL = 0.98
 """Probability with which an interval is to hold its constant."""
 _ITERATIONS = 12
+_TURNS, _SETTLED = 8, 0.2
+"""Most fits in a row, and the relative change of the residuals' weight below which it is no longer corrected."""
 _STEP = 0.02
 """Perturbation for derivatives, in standard deviations of the prior."""
 
@@ -44,15 +46,17 @@ class Kind:
     high: float
     each_joint: bool = False
     """True where every joint has its own, False where all joints of a group share it."""
+    apart: float | None = None
+    """Standard deviation of the joints of a group from each other, where they are alike: that of what they share is ``spread``."""
     unit: str = ""
 
 
 KINDS: dict[str, Kind] = {
     "armature": Kind(spread=0.02, low=1e-5, high=1.0, unit="kg·m²"),
-    "joint_damping": Kind(spread=0.3, low=0.0, high=20.0, each_joint=True, unit="N·m·s/rad"),
+    "joint_damping": Kind(spread=0.3, low=0.0, high=20.0, each_joint=True, apart=0.05, unit="N·m·s/rad"),
     "friction_loss": Kind(spread=0.5, low=0.0, high=20.0, each_joint=True, unit="N·m"),
-    "stiffness_factor": Kind(spread=0.1, low=0.3, high=2.0, each_joint=True),
-    "damping_factor": Kind(spread=0.1, low=0.3, high=2.0, each_joint=True),
+    "stiffness_factor": Kind(spread=0.1, low=0.3, high=2.0, each_joint=True, apart=0.02),
+    "damping_factor": Kind(spread=0.1, low=0.3, high=2.0, each_joint=True, apart=0.02),
     "target_offset": Kind(spread=0.05, low=-0.5, high=0.5, each_joint=True, unit="rad"),
 }
 """Constants of the robot; each log adds a ``delay`` and, unreported, the velocities of its first row."""
@@ -150,6 +154,16 @@ class _Problem:
 
     def spreads(self) -> Array:
         return np.array([u.kind.spread for u in self.unknowns])
+
+    def precision(self, free: NDArray[np.int64]) -> Array:
+        """Return the inverse covariance of some unknowns' priors, (F, F); joints that are alike are correlated."""
+        covariance = np.diag(self.spreads() ** 2)
+        of = [(u.key, self.groups[u.joints[0]]) for u in self.unknowns]
+        for i, one in enumerate(self.unknowns):
+            if one.kind.apart is not None:
+                covariance[i, [k for k, other in enumerate(of) if other == of[i]]] = one.kind.spread**2
+                covariance[i, i] += one.kind.apart**2
+        return np.asarray(np.linalg.inv(covariance[np.ix_(free, free)]), dtype=np.float64)
 
     def constants(self, x: Array, number: int | None = None) -> dict[str, Array]:
         """Return the constants of a guess by key, (J,) each; ``start`` and ``delay`` those of a log."""
@@ -310,27 +324,26 @@ def identify(
 def _identify(problem: _Problem, draws: int, seed: int, say: Say) -> Fit:
     x, spreads, priors = problem.priors(), problem.spreads(), problem.priors()
     known = np.ones(len(x), dtype=bool)
-    trust = 0.02  # weight of a residual against the prior, corrected below by what the fit leaves
-    for turn in range(3):
-        free = np.flatnonzero(known)
+    trust = 1.0  # weight of a residual against the prior, corrected below by what the fit leaves
+    for turn in range(_TURNS):
+        free, weight = np.flatnonzero(known), trust
         x[~known] = priors[~known]
-        x = _descend(problem, x, free, trust, say)
+        x = _descend(problem, x, free, weight, say)
         residual, jacobian = problem.jacobian(x, free)
         trust = 1.0 / max(_inflated(problem, residual), 1e-12)
-        hessian = trust * jacobian.T @ jacobian + np.diag(spreads[free] ** -2)
+        if abs(trust / weight - 1.0) > _SETTLED and turn < _TURNS - 2:
+            continue  # priors bent the fit by more than what it leaves allows
+        hessian = trust * jacobian.T @ jacobian + problem.precision(free)
         after = np.sqrt(np.diag(np.linalg.inv(hessian))) / spreads[free]
         told = np.array([a < _KNOWN or problem.unknowns[u].key == "start" for a, u in zip(after, free, strict=True)])
-        if turn and told.all():
+        if told.all() or turn == _TURNS - 1:
             break
-        if turn < 2:
-            known[free[~told]] = False
-    drawn = _bootstrap(problem, x, free, residual, jacobian, trust, draws, seed)
-    spread = drawn.std(axis=0)
+        known[free[~told]] = False
+    drawn, telling = _bootstrap(problem, x, free, residual, jacobian, trust, draws, seed)
     from scipy import stats
 
-    blocks = int(problem.block.max()) + 1
-    tail = (1.0 + _LEVEL) / 2.0
-    reach, widest = float(stats.t.ppf(tail, max(blocks - 1, 1))), float(stats.norm.ppf(tail)) * spreads
+    spread, tail = drawn.std(axis=0), (1.0 + _LEVEL) / 2.0
+    reach, widest = stats.t.ppf(tail, np.maximum(telling - 1.0, 1.0)), float(stats.norm.ppf(tail)) * spreads
     intervals = np.stack([priors - widest, priors + widest], axis=1)
     intervals[free] = np.stack([x[free] - reach * spread, x[free] + reach * spread], axis=1)
     intervals = intervals.clip(*(bound[:, None] for bound in problem.bounds()))
@@ -352,6 +365,7 @@ def _descend(problem: _Problem, x: Array, free: NDArray[np.int64], trust: float,
 
     low, high = (b[free] for b in problem.bounds())
     spreads, priors = problem.spreads()[free], problem.priors()[free]
+    whiten = np.linalg.cholesky(problem.precision(free)).T
     memory: dict[bytes, tuple[Array, Array]] = {}
     turns = 0
 
@@ -362,7 +376,7 @@ def _descend(problem: _Problem, x: Array, free: NDArray[np.int64], trust: float,
 
     def residuals(part: Array) -> Array:
         found = problem.series(whole(part)[None])[0]
-        return np.concatenate([np.sqrt(trust) * found, (part - priors) / spreads])
+        return np.concatenate([np.sqrt(trust) * found, whiten @ (part - priors)])
 
     def derivatives(part: Array) -> Array:
         nonlocal turns
@@ -372,7 +386,7 @@ def _descend(problem: _Problem, x: Array, free: NDArray[np.int64], trust: float,
             memory.clear()
             memory[part.tobytes()] = problem.jacobian(whole(part), free)
         found = memory[part.tobytes()][1]
-        return np.concatenate([np.sqrt(trust) * found, np.diag(1.0 / spreads)])
+        return np.concatenate([np.sqrt(trust) * found, whiten])
 
     inside = np.clip(x[free], low + 1e-9, high - 1e-9)
     solved = least_squares(
@@ -408,8 +422,8 @@ def _bootstrap(
     trust: float,
     draws: int,
     seed: int,
-) -> Array:
-    """Return the free unknowns of each draw of whole blocks of time and of the priors' means, one Newton step from the fit, (draws, F)."""
+) -> tuple[Array, Array]:
+    """Return the free unknowns of each draw of blocks and priors, (draws, F), and how many equal blocks tell each as well, (F,)."""
     blocks = int(problem.block.max()) + 1
     order = np.argsort(problem.block, kind="stable")
     edges = np.searchsorted(problem.block[order], np.arange(blocks + 1))
@@ -419,28 +433,16 @@ def _bootstrap(
         rows = order[edges[b] : edges[b + 1]]
         hessians[b] = trust * jacobian[rows].T @ jacobian[rows]
         gradients[b] = trust * jacobian[rows].T @ residual[rows]
-    spreads = problem.spreads()[free]
-    prior_gradient = (x[free] - problem.priors()[free]) / spreads**2
+    precision = problem.precision(free)
+    prior_gradient = precision @ (x[free] - problem.priors()[free])
     centre = gradients.sum(axis=0) + prior_gradient  # zero at an optimum inside the bounds
     random = np.random.default_rng(seed)
     counts = random.multinomial(blocks, np.full(blocks, 1.0 / blocks), size=draws)
-    guesses = random.normal(size=(draws, len(free))) / spreads  # where the prior decides, its spread is the uncertainty
+    guesses = random.normal(size=(draws, len(free))) @ np.linalg.cholesky(precision).T  # where the prior decides
     found = np.empty((draws, len(free)))
     for d, count in enumerate(counts):
-        hessian = np.tensordot(count, hessians, axes=1) + np.diag(spreads**-2)
+        hessian = np.tensordot(count, hessians, axes=1) + precision
         found[d] = x[free] - np.linalg.solve(hessian, count @ gradients + prior_gradient - centre + guesses[d])
-    return found
-
-
-def held_out_ratios(log: Log, nominal: Motion, found: Motion) -> dict[str, dict[str, Any]]:
-    """Return the ratio of two replays' RMS differences by group and quantity, the nominal one below."""
-    groups = joint_groups(log.robot)
-    errors = differences(log, nominal), differences(log, found)
-    result: dict[str, dict[str, Any]] = {group: {} for group in groups}
-    for quantity in errors[0]:
-        if quantity == "velocity":
-            continue
-        below, above = (Squares(log, e[quantity]) for e in errors)
-        for group, joints in groups.items():
-            result[group][quantity] = above.rms(joints) / max(below.rms(joints), 1e-12)
-    return result
+    inverse = np.linalg.inv(hessians.sum(axis=0) + precision)
+    told = np.einsum("ij,bjk,ki->bi", inverse, hessians, inverse, optimize=True)
+    return found, told.sum(axis=0) ** 2 / (told**2).sum(axis=0).clip(1e-300)

@@ -18,14 +18,15 @@ from ...files.writing import json_text, write_files
 from ...gauge.play.remaining import Stage
 from ...robots import JointParameters
 from ...robots.loading import PER_JOINT
-from ...robots.sets import find_set, set_text
+from ...robots.sets import find_set, joint_groups, set_text
 from ...version import __version__
 from ..turns import Turns, Watch
-from .identification import KINDS, Fit, held_out_ratios, identify
+from .identification import KINDS, Fit, identify
 from .log import Log, LogError
 from .page import render_identified
 from .replaying import check_torque, fit_delay, hung_or_standing, read_logs
 from .request import IdentifyRequest
+from .residuals import Squares, differences
 from .rig import FixedRig, Motion, acting_parameters, at_rows, beginning, held_targets, num_steps
 
 _HALVES = 0.7
@@ -119,7 +120,21 @@ def _residuals(
     """Return the ratios of a set's residuals to the nominal one's, its delay fitted to this log."""
     delay = fit_delay(log, found, threads=threads) if fitted else found.delay or 0.0
     motions = replay_fixed(log, base, base.delay or 0.0), replay_fixed(log, found, delay)
-    return {"name": log.name, "delay": delay, "ratios": held_out_ratios(log, *motions)}
+    return {"name": log.name, "delay": delay, "ratios": _ratios(log, *motions)}
+
+
+def _ratios(log: Log, nominal: Motion, found: Motion) -> dict[str, dict[str, Any]]:
+    """Return the ratio of two replays' RMS differences by group and quantity, the nominal one below."""
+    groups = joint_groups(log.robot)
+    errors = differences(log, nominal), differences(log, found)
+    result: dict[str, dict[str, Any]] = {group: {} for group in groups}
+    for quantity in errors[0]:
+        if quantity == "velocity":
+            continue
+        below, above = (Squares(log, e[quantity]) for e in errors)
+        for group, joints in groups.items():
+            result[group][quantity] = above.rms(joints) / max(below.rms(joints), 1e-12)
+    return result
 
 
 def _unknown(found: Fit, number: int) -> dict[str, Any]:

@@ -9,7 +9,7 @@ import pytest
 from gaitgauge.robots import RobotError, load_robot
 from gaitgauge.robots.sets import find_set
 from gaitgauge.studies.reality.chirp import Chirp, simulated_log
-from gaitgauge.studies.reality.identification import identify
+from gaitgauge.studies.reality.identification import _Problem, identify
 from gaitgauge.studies.reality.identifying import identify_robot
 from gaitgauge.studies.reality.log import LogError, save_log
 from gaitgauge.studies.reality.request import IdentifyRequest
@@ -47,6 +47,18 @@ def test_a_log_becomes_a_set_that_replays_it(log, tmp_path):
     assert "armature calf" in (tmp_path / "out" / "identify.html").read_text(encoding="utf-8")
     with pytest.raises(RobotError, match="not for 'go1'"):
         find_set(load_robot("go1", check=False), str(tmp_path / "out" / "identified.toml"))
+
+
+def test_joints_of_a_kind_are_alike_beforehand(log):
+    problem = _Problem([log], NOMINAL, 1)
+    problem.rig.close()
+    labels = [unknown.label for unknown in problem.unknowns]
+    covariance = np.linalg.inv(problem.precision(np.arange(len(labels))))
+    hip, other = labels.index("stiffness_factor FL_hip"), labels.index("stiffness_factor RR_hip")
+    assert covariance[hip, other] == pytest.approx(0.1**2)
+    assert covariance[hip, hip] == pytest.approx(0.1**2 + 0.02**2)
+    for apart in ("stiffness_factor FL_calf", "damping_factor RR_hip", "armature hip"):
+        assert covariance[hip, labels.index(apart)] == pytest.approx(0.0, abs=1e-12)
 
 
 def test_what_a_log_does_not_tell_stays_at_its_prior(log):
