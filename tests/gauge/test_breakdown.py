@@ -114,7 +114,7 @@ def test_which_scores_compare_is_said_with_an_example_that_does_not():
         "this score compares only with scores of robogauge-1.1 1.1.0 for the robot go1 on the engine mujoco; other suites have "
         "other scales: pretrained-go1 has 0.6826 on robogauge-1.1 1.1.0 and 0.4552 on gaitgauge-1 1.1.0"
     )
-    assert comparable(result(robot="anymal_c")).endswith("for the robot anymal_c on the engine mujoco")
+    assert comparable(result(robot="mine")).endswith("for the robot mine on the engine mujoco")
     assert [r.policy for r in references_for(result(robot="go1"))] == ["pretrained-go1"]
     part = replace(result(), coverage=Coverage(kind="part", text="2 of 7 terrains"))
     assert comparable(part).startswith(
