@@ -11,7 +11,7 @@ from gaitgauge.policy.loading import load_policy
 
 def test_every_policy_of_the_sweeps_is_named_once():
     names = [each["name"] for each in listed()]
-    assert len(names) == len(set(names)) == 15
+    assert len(names) == len(set(names)) == 16
     assert {each["path"].split("/")[3] for each in listed() if each["path"].startswith("docs")} == {
         "baselines",
         "from-nothing",
