@@ -14,6 +14,7 @@ import pytest
 import typer
 from gaitgauge.cli.console import Terminal, make_table, shell_command
 from gaitgauge.cli.errors import UserError, report_errors
+from gaitgauge.cli.main import main
 from gaitgauge.cli.progress import ProgressDisplay, _starting_again, duration
 from rich.text import Text
 
@@ -123,6 +124,16 @@ def test_another_start_finds_its_files_in_memory(monkeypatch, load, again):
     monkeypatch.setattr("os.cpu_count", lambda: 4)
     monkeypatch.setattr("time.process_time", lambda: 3.0)
     assert _starting_again(20.0) == again
+
+
+def test_the_end_searches_for_no_garbage(monkeypatch):
+    """A jury was silent for 5 s after its last word, and on a busy machine for 27 s."""
+    frozen = []
+    monkeypatch.setattr("gc.freeze", lambda: frozen.append(True))
+    monkeypatch.setattr("sys.argv", ["gaitgauge", "--version"])
+    with pytest.raises(SystemExit):
+        main()
+    assert frozen == [True]
 
 
 STARTED = "evaluate p|compare p q|verify c|jury p|consistency p|trial p|worst p|latent p|sweep s|replay r --robot go2"
