@@ -27,8 +27,8 @@ _COLUMNS = 4
 """Details side by side."""
 _LEAST = 1.0
 """Time that is shown where the estimate has run out [s]."""
-_CLOSING = 0.6
-"""Time of the page, the tables and the end of the process over that of the start: both load packages, read files and are Python's."""
+_CLOSING = 0.3
+"""Time of the page and the tables over that of the start: both load packages and read files."""
 
 
 class ProgressDisplay:

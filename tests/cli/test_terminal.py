@@ -112,8 +112,8 @@ def test_a_command_is_not_silent_while_it_imports_and_reads(monkeypatch):
         with ProgressDisplay(terminal, "another", clock=lambda: now) as display:
             display.update(1.0, "1 of 1", last=True)
 
-    lines = "9 s: evaluate, starting", "18 s: evaluate, starting", "27 s: gauging, 1 of 2, about 36 s left"
-    # a start of 18 s means that the page and the end take 0.6 times as long
+    lines = "9 s: evaluate, starting", "18 s: evaluate, starting", "27 s: gauging, 1 of 2, about 30 s left"
+    # a start of 18 s means that the page and the tables take 0.3 times as long
     assert shown(show).splitlines() == [*lines, "0 s: another, 1 of 1"]
 
 
