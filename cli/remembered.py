@@ -24,7 +24,7 @@ _KEPT = 200
 """Command lines of which the time is kept: the last ones."""
 _PARTS = 50
 """Parts of the work, by the share that is done."""
-_MOST = 20.0
+_MOST = 3.0
 """Greatest correction of an estimate, as a factor or a divisor."""
 
 
