@@ -168,7 +168,7 @@ def evaluation() -> None:
 
 def studies() -> None:
     """Shoot the pages of a comparison, a board, field trials, a look into the latent and a study of engines."""
-    a, b = str(CARDS / "pretrained-gaitgauge-1.json.gz"), str(CARDS / "cts-gaitgauge-1.json.gz")
+    a, b = str(CARDS / "shipped-on-2026-11-28-gaitgauge-1.json.gz"), str(CARDS / "cts-gaitgauge-1.json.gz")
     engines = (
         "--backends",
         "mujoco,mujoco@foot_condim=3",

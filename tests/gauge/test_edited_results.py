@@ -45,7 +45,7 @@ def edited(tmp_path):
 def test_an_expected_level_is_no_edited_one():
     """A card of gaitgauge-1 was refused for levels that are no whole numbers."""
     card = load_result(
-        Path(__file__).parents[2] / "docs/data/scorecards/pretrained-gaitgauge-1.json.gz", intervals=False
+        Path(__file__).parents[2] / "docs/data/scorecards/shipped-on-2026-11-28-gaitgauge-1.json.gz", intervals=False
     )
     assert any(row.reached % 1 for row in card.environments)
 

@@ -55,7 +55,7 @@ def test_what_was_found_is_what_its_file_says(pipeline, suite):
 
 def test_a_card_keeps_all_that_an_evaluation_wrote():
     """A card adds figures of its own, which no evaluation has, behind those."""
-    for name in ("pretrained-gaitgauge-1", "pretrained-robogauge-1.1"):
+    for name in ("cts-gaitgauge-1", "pretrained-robogauge-1.1"):
         card = json.loads(gzip.decompress((ROOT / "docs" / "data" / "scorecards" / f"{name}.json.gz").read_bytes()))
         assert read(card).to_data() == {k: v for k, v in card.items() if k not in ("tolerance", "repeatability")}
 

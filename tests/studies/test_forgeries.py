@@ -47,6 +47,16 @@ def test_the_worst_forgeries_are_refused_in_one_sentence(card, tmp_path, kind):
         assert said and said.isprintable() and "\n" not in said
 
 
+def test_kinds_that_change_nothing_are_left_out(card, tmp_path):
+    """With one seed and one environment a terrain there is nothing to swap or to copy."""
+    few = sample(suite="demo", resamples=2000, terrains=("flat", "slope_fd"), frictions=(0.6,)).to_data()
+    few["tolerance"] = [0.1, 0.2]
+    kinds = [name for name in forgeries.forge(few) if name.endswith(("swapped", "copy of the best"))]
+    assert len(kinds) == 2
+    assert [name for kind in kinds for name, *_ in forgeries.tried(few, tmp_path, only=kind)] == []
+    assert [name for name, *_ in forgeries.tried(card, tmp_path, only=kinds[0])] == kinds[:1]
+
+
 @pytest.mark.slow
 def test_all_kinds_of_forgeries_are_refused(card, tmp_path):
     found = list(forgeries.tried(card, tmp_path))

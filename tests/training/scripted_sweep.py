@@ -13,7 +13,7 @@ from gaitgauge.training.sweep.jobs import Jobs
 from gaitgauge.training.sweep.runs import SweepRun
 
 ROOT = Path(__file__).parents[2]
-CARD = ROOT / "docs" / "data" / "scorecards" / "standing-gaitgauge-1.json"
+CARD = ROOT / "docs" / "data" / "scorecards" / "standing-robogauge-1.1.json"
 ENTRY = SweepEntry(name="one", task="go2-cts")
 SWEEP = Sweep(name="toy", title="A toy", entry=(ENTRY,), backend="fake", training_suite="none")
 

@@ -237,7 +237,7 @@ def test_damaged_kept_curves_leave_the_score(kept):
 
 
 OTHER_SUITE = replace(SWEEP, suite="gaitgauge-1")
-OTHER_CARD = CARD.with_name("standing-gaitgauge-1.json")
+OTHER_CARD = CARD.with_name("standing-demo.json")
 
 
 @pytest.mark.parametrize("begun", [False, True])
