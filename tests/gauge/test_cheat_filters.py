@@ -1,5 +1,6 @@
 """The search for cheats: what a filtered policy is told, and when a gain counts."""
 
+import itertools
 import math
 
 import cheats
@@ -110,3 +111,23 @@ def test_jobs_that_have_ended_are_not_played_again(tmp_path, monkeypatch):
     assert len(scores.found) == 3 * 8
     cheats.play_all(jobs, tmp_path, 1, scores)
     assert len(played) == 2
+
+
+def test_the_thirds_of_a_screen_are_all_places_once():
+    terrains, frictions = ("flat", "wave", "stairs_fd", "obstacle"), (0.3, 0.6, 0.9)
+    turns = [cheats.thirds(terrains, frictions, turn) for turn in range(3)]
+    assert all([terrain for terrain, _ in turn] == list(terrains) for turn in turns)
+    assert sorted(place for turn in turns for place in turn) == sorted(itertools.product(terrains, frictions))
+    assert {friction for _, friction in turns[0]} == set(frictions)
+
+
+def test_a_screen_tells_which_of_the_best_it_would_lose(capsys):
+    """Four filters: one gains everywhere, one loses only where the first third looks."""
+    scores, terrains = Scores(), ("flat", "wave", "stairs_fd")
+    first = cheats.thirds(terrains, scores.frictions, 0)
+    for place in itertools.product(terrains, scores.frictions):
+        for name, gain in {"none": 0.0, "a": 0.1, "b": 0.2 * (place not in first) - 0.2, "c": -0.1, "d": -0.3}.items():
+            scores.found[name, *place, 1] = gain, 0
+    cheats.judge_screen(scores, terrains, [(name, 1) for name in "abcd"])
+    assert [line.split()[2:] for line in capsys.readouterr().out.splitlines()[2:]] == [["0", "of", "1"]] * 3
+    assert scores.third("b", terrains, 0, 1) == pytest.approx(-0.2) and scores.third("b", terrains, 1, 1) == 0.0
