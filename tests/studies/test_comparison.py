@@ -338,10 +338,17 @@ def test_csv_of_one_seed_has_empty_ends():
     assert replace(found.differences[0], corrected=0.01).real
 
 
-@pytest.mark.parametrize("suite", ["robogauge-1.1", "gaitgauge-1"])
-@pytest.mark.parametrize("names", [("pretrained", "standing"), pytest.param("*", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("suite", "names"),
+    [
+        ("robogauge-1.1", ("pretrained", "standing")),
+        ("gaitgauge-1", ("shipped-on-2026-11-28", "cts")),
+        pytest.param("robogauge-1.1", "*", marks=pytest.mark.slow),
+        pytest.param("gaitgauge-1", "*", marks=pytest.mark.slow),
+    ],
+)
 def test_score_cards_that_ship_can_be_compared(suite, names):
-    """Of the pretrained policy and a standing robot, and of all."""
+    """Two of a suite, and all."""
     paths = [path for name in names for path in sorted(SCORE_CARDS.glob(f"{name}-{suite}.json*"))]
     cards = [load_result(path, intervals=False) for path in paths]
     cards = [replace(card, chance=replace(card.chance, resamples=200)) for card in cards]  # of 2000, which take seconds
