@@ -196,7 +196,6 @@ def test_warnings_come_after_the_score_and_in_proportion(stress):
 
 def test_the_first_page_that_a_user_sees_has_no_grave_warning():
     shipped = load_result(Path(__file__).parents[2] / "docs" / "data" / "scorecards" / "pretrained-demo.json")
-    assert shipped.health.falls > 0
     assert {found["severity"] for found in warnings(shipped.environments, shipped.health)} <= {"note", "slight"}
 
 
