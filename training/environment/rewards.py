@@ -41,8 +41,11 @@ def turn_error(inputs: StepInputs) -> torch.Tensor:
     """Absolute error of the yaw rate [rad/s], averaged over ``turn_error_time``, at most ``LARGEST_TURN_ERROR``; 0 but for turns on the
     spot of ``SLOWEST_TURN`` or more.
     """
-    turns = ~commanded_to_move(inputs.command) & (inputs.command[:, 2].abs() >= SLOWEST_TURN)
-    return torch.where(turns, inputs.turn_error.abs().clamp(max=LARGEST_TURN_ERROR), 0.0)
+    yaw, error = inputs.command[:, 2], inputs.turn_error
+    if error is None:
+        error = yaw - inputs.base_angular_velocity_b[:, 2]
+    turns = ~commanded_to_move(inputs.command) & (yaw.abs() >= SLOWEST_TURN)
+    return torch.where(turns, error.abs().clamp(max=LARGEST_TURN_ERROR), 0.0)
 
 
 def progress(inputs: StepInputs) -> torch.Tensor:

@@ -261,7 +261,8 @@ class EnvironmentStep:
         memory.issued.add_(drawn.command[:, :2] * due[:, None])
         if self.scenarios is not None:
             self.scenarios.tell(memory.command, due, memory.holds_heading, memory.episode_length)
-        memory.turn_error.masked_fill_(due, 0.0)
+        if self.configuration.rewards.turn_error_time:
+            memory.turn_error.masked_fill_(due, 0.0)
         return due
 
     def observe(self) -> Observations:

@@ -70,8 +70,9 @@ class StepInputs:
     """Height of the base over the mean ground below the trunk [m], (N,)."""
     command: torch.Tensor
     """Forward, lateral [m/s] and yaw [rad/s] speed, (N, 3)."""
-    turn_error: torch.Tensor
-    """Commanded less actual yaw rate [rad/s], averaged over ``RewardShapes.turn_error_time`` since the command was drawn, (N,)."""
+    turn_error: torch.Tensor | None
+    """Commanded less actual yaw rate [rad/s], averaged over ``RewardShapes.turn_error_time`` since the command was drawn, (N,); None
+    where that time is 0."""
     sigma: torch.Tensor
     """Tracking width of each command axis, (N, 3)."""
     joint_position: torch.Tensor

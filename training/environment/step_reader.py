@@ -66,7 +66,7 @@ class StepReader:
         self._period = configuration.physics.control_period
         self._longest = longest
         time = self._settings.turn_error_time
-        self._newest = -math.expm1(-self._period / time) if time else 1.0
+        self._newest = -math.expm1(-self._period / time) if time else None
         self._device = device = kind.device
         area = 0.5 * torch.tensor(self._settings.trunk_area, device=device) + 1e-4
         self._trunk_points = scan[(scan.abs() <= area).all(dim=1)]
@@ -158,9 +158,9 @@ class StepReader:
             base_quaternion_w=state.base_quaternion_w,
             base_height=base[:, 2] - below_base,
             command=memory.command,
-            turn_error=memory.turn_error.lerp_(
-                memory.command[:, 2] - state.base_angular_velocity_b[:, 2], self._newest
-            ),
+            turn_error=None
+            if self._newest is None
+            else memory.turn_error.lerp_(memory.command[:, 2] - state.base_angular_velocity_b[:, 2], self._newest),
             sigma=self.sigma(memory),
             joint_position=state.joint_position,
             joint_velocity=state.joint_velocity,
