@@ -59,7 +59,7 @@ def test_an_engine_without_its_extra_is_named_with_the_command_that_installs_it(
     if name in INSTALLED:
 
         def gone(module, package):
-            raise ImportError(f"No module named '{PACKAGES[name]}'", name=PACKAGES[name])
+            raise ModuleNotFoundError(f"No module named '{PACKAGES[name]}'", name=PACKAGES[name])
 
         monkeypatch.setattr(registry, "import_module", gone)
     with pytest.raises(BackendError, match=rf"'{name}' needs .* not installed: pip install 'gaitgauge\[{name}\]'$"):
