@@ -44,10 +44,9 @@ def visual_model(robot: Robot, terrain: Terrain, quality: Quality = RICH) -> muj
     seen, solid = (
         {geom.parent.name for geom in spec.geoms if geom.group == group} for group in (VISUAL_GROUP, COLLISION_GROUP)
     )
+    complete = 2 * len(seen) > len(solid)  # else the visible shapes are not all of the robot
     for geom in list(spec.geoms):
-        if geom.group == COLLISION_GROUP and 2 * len(seen) > len(
-            solid
-        ):  # else the visible shapes are not all of the robot
+        if geom.group == COLLISION_GROUP and complete:
             spec.delete(geom)
     return spec.compile()
 

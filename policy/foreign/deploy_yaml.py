@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -48,7 +48,10 @@ def read_deploy(data: Mapping[str, Any], path: Path, asked: Robot | None, *, of_
     with checked(path, "deploy.yaml"):
         turned = dict(data["actions"]).get(_TURNED) is not None
         joints = len(data["joint_ids_map"])
-        fits: Callable[[Robot], bool] = lambda r: bool(r.velocity_joints) if turned else r.num_joints == joints  # noqa: E731
+
+        def fits(robot: Robot) -> bool:
+            return bool(robot.velocity_joints) if turned else robot.num_joints == joints
+
         feature = "wheels" if turned else f"{joints} joints"
         robot, chosen = (asked, None) if asked else fitting_robot(fits, feature, path)
         data, completed = _with_wheels(data, robot) if turned else (data, None)
