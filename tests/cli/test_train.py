@@ -105,6 +105,11 @@ def test_time_limit_ends_with_success(run, tmp_path):
     [
         (("go2-mo-cts",), ("'go2-mo-cts'", "go2-moe-cts")),
         (("go2-flat", "environment.push.linaer=1"), ("'environment.push.linaer'", "environment.push.linear")),
+        (
+            ("go2-flat", "--iterations", 3, "training.run.iterations=4"),
+            ("--iterations 3 and training.run.iterations=4 contradict each other; leave one of them out",),
+        ),
+        (("go2-flat", "--num-envs", 3, "environment.num_envs = 4"), ("--num-envs 3 and environment.num_envs = 4",)),
         (("go2-flat", "num_envs=3"), ("'num_envs'", "environment.num_envs")),
         (("go2-flat", "training.run.iterations=many"), ("'many'", "whole number")),
         (("go2-flat", "something"), ("'something'", "key=value")),
@@ -342,13 +347,18 @@ def test_every_setting_says_what_it_means():
                 assert text, f"{group}.{name}"
 
 
-def test_options_are_overrides_and_settings_win():
+def test_options_are_overrides_that_settings_may_repeat():
     request = TrainRequest(
-        task="go2-flat", backend="fake", num_envs=16, seed=7, overrides=("environment.num_envs=24",), score_every=50
+        task="go2-flat",
+        backend="fake",
+        num_envs=24,
+        seed=7,
+        overrides=("environment.num_envs=24", "environment.seed=8"),
+        score_every=50,
     )
     task = prepare(request).task
     assert task.environment.num_envs == 24
-    assert task.environment.seed == task.training.run.seed == 7
+    assert (task.environment.seed, task.training.run.seed) == (8, 7)
     assert task.training.run.gauge_interval == 50
 
 

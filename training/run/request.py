@@ -13,6 +13,15 @@ from ...files.choices import PLACE, PLAYED, SCORES, SPAN, WRITTEN, Choice
 
 LOG_ROOT = Path("logs/rsl_rl")
 """Root of the training runs: ``<LOG_ROOT>/<experiment>/<run>/``."""
+_OPTIONS = {
+    "environment.num_envs": "num_envs",
+    "training.run.iterations": "iterations",
+    "training.run.run_name": "run_name",
+    "training.run.gauge_interval": "score_every",
+    "training.run.video_interval": "video_every",
+    "training.run.logger": "logger",
+}
+"""Settings that have an option of their own; ``seed`` sets two, and either may be given beside it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,22 +136,22 @@ class TrainRequest:
     ] = None
 
     def own_overrides(self) -> list[str]:
-        """Return options and settings as overrides, options first, so that a setting spelled out wins."""
-        options = {
-            "environment.num_envs": self.num_envs,
-            "environment.seed": self.seed,
-            "training.run.seed": self.seed,
-            "training.run.iterations": self.iterations,
-            "training.run.run_name": self.run_name,
-            "training.run.gauge_interval": self.score_every,
-            "training.run.video_interval": self.video_every,
-            "training.run.logger": self.logger,
-        }
-        return [f"{key}={value}" for key, value in options.items() if value is not None] + list(self.overrides)
+        """Return options and settings as overrides."""
+        options = {"environment.seed": "seed", "training.run.seed": "seed"} | _OPTIONS
+        given = [f"{key}={getattr(self, name)}" for key, name in options.items() if getattr(self, name) is not None]
+        return given + list(self.overrides)
 
     def __post_init__(self) -> None:
-        """Check the types and ranges of all fields."""
-        from ...files.parsing import check_fields
+        """Check the types and ranges of all fields, and that no option and setting contradict each other."""
+        from ...files.parsing import check_fields, one_line
         from ..configuration import ConfigurationError
 
         check_fields(self, "what is to be trained", ConfigurationError)
+        for override in self.overrides:
+            key, _, value = map(str.strip, override.partition("="))
+            chosen = getattr(self, _OPTIONS[key]) if key in _OPTIONS else None
+            if chosen is not None and value != str(chosen):
+                option = f"--{_OPTIONS[key].replace('_', '-')} {one_line(chosen)}"
+                raise ConfigurationError(
+                    f"{option} and {one_line(override)} contradict each other; leave one of them out"
+                )
