@@ -21,7 +21,7 @@ from ...terrains.registry import gauge_terrain_names
 from .attribution import FLOOR_DRAWS, Factor, choose_factors, rounded
 from .closed_loop import Cell, Design, make_cells
 from .request import ConsistencyError, StudyRequest
-from .variants import Variant, parse_variant, place
+from .variants import Variant, parse_variant, parse_variants, place
 
 LEVEL = 3
 """Level of terrains that have levels, where none is asked for."""
@@ -186,7 +186,7 @@ def prepare_study(request: StudyRequest) -> PreparedStudy:
 
 def _engines(request: StudyRequest, suite: Suite) -> tuple[Variant, list[Variant], list[dict[str, str]]]:
     """The reference, the others, and those that cannot run on this machine."""
-    variants = {v.label: v for v in (parse_variant(text) for text in request.backends or default_engines())}
+    variants = parse_variants(request.backends or default_engines())
     wanted = parse_variant(request.reference).label if request.reference else next(iter(variants), None)
     if wanted is None or len(variants) + (wanted not in variants) < 2:
         raise ConsistencyError("a comparison needs two engines; give for example --backends mujoco,mujoco-warp")

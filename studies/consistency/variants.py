@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
 from typing import Any, get_type_hints
 
@@ -101,6 +102,20 @@ def parse_variant(text: str) -> Variant:
             )
         overrides[name] = from_text(hints[name], value, f"@{name}", ConsistencyError)
     return Variant(backend=backend, overrides=tuple(sorted(overrides.items())))
+
+
+def parse_variants(texts: Iterable[str]) -> dict[str, Variant]:
+    """Return what ``parse_variant`` reads in each text, by label.
+
+    Raises:
+        ConsistencyError: as there, or two texts name the same engine with the same options.
+    """
+    found: dict[str, Variant] = {}
+    for variant in map(parse_variant, texts):
+        if variant.label in found:
+            raise ConsistencyError(f"{shown(variant.label)} is named twice; name every engine once")
+        found[variant.label] = variant
+    return found
 
 
 def place(variant: Variant, device: str | None) -> Variant:

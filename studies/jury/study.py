@@ -29,7 +29,7 @@ from ...gauge.suite import Suite, load_suite
 from ...robots import Robot
 from ...robots.loading import robot_digest
 from ..consistency.closed_loop import Cell, play_variant
-from ..consistency.variants import Variant, parse_variant, place
+from ..consistency.variants import Variant, parse_variants, place
 from ..engine_pace import EnginePace, measure_all, measure_cost
 from ..naming import folder_name
 from ..policies import Loaded, describe, load_policies
@@ -130,15 +130,14 @@ def _engines(request: JuryRequest, suite: Suite) -> tuple[list[Variant], list[di
     """Return the engines that judge, and those of the default that cannot run on this machine."""
     found: dict[str, Variant] = {}
     skipped = []
-    for text in request.engines or ENGINES:
-        variant = parse_variant(text)
+    for label, variant in parse_variants(request.engines or ENGINES).items():
         variant.physics(suite.physics)
         try:
-            found[variant.label] = place(variant, request.device or _device())
+            found[label] = place(variant, request.device or _device())
         except BackendError as error:
             if request.engines:
                 raise
-            skipped.append({"engine": variant.label, "reason": str(error)})
+            skipped.append({"engine": label, "reason": str(error)})
     if not found:
         raise JuryError(f"no engine can judge here: {'; '.join(s['reason'] for s in skipped)}")
     return list(found.values()), skipped

@@ -22,7 +22,7 @@ from ...files.writing import json_text, make_folder, write_atomically
 from ...gauge.suite import load_suite
 from ...robots import Robot
 from ...robots.loading import robot_digest
-from ..consistency.variants import Variant, parse_variant, place
+from ..consistency.variants import Variant, parse_variant, parse_variants, place
 from ..naming import free_folder
 from ..policies import Loaded, describe, load_policies
 from ..trials.scenario import Scenario, scenario_text
@@ -100,25 +100,22 @@ def prepare_search(request: WorstRequest) -> PreparedSearch:
     """
     suite = load_suite(request.suite)
     device = request.device or ("cuda" if torch.cuda.is_available() else "cpu")
-    engine = _placed(request.backend, device)
+    engine = _placed(parse_variant(request.backend), device)
     engine.physics(suite.physics)
     others: dict[str, Variant] = {}
     skipped = []
-    for text in OTHERS if request.others is None else request.others:
-        variant = parse_variant(text)
+    for label, variant in parse_variants(OTHERS if request.others is None else request.others).items():
         variant.physics(suite.physics)
-        if variant.label == engine.label:
+        if label == engine.label:
             if request.others is not None:
-                raise WorstError(
-                    f"--others names {shown(variant.label)}, the engine that is searched; name another one"
-                )
+                raise WorstError(f"--others names {shown(label)}, the engine that is searched; name another one")
             continue
         try:
-            others[variant.label] = _placed(text, device)
+            others[label] = _placed(variant, device)
         except BackendError as error:
             if request.others is not None:
                 raise
-            skipped.append({"engine": variant.label, "reason": str(error)})
+            skipped.append({"engine": label, "reason": str(error)})
     loaded, refused = load_policies(
         [request.policy], request.robot, trust=request.trust, contract_file=request.contract
     )
@@ -138,8 +135,7 @@ def prepare_search(request: WorstRequest) -> PreparedSearch:
     )
 
 
-def _placed(text: str, device: str) -> Variant:
-    variant = parse_variant(text)
+def _placed(variant: Variant, device: str) -> Variant:
     return place(variant, None if device == "cuda" else "cpu")
 
 

@@ -312,7 +312,7 @@ def test_every_layer_plays_with_the_gains_of_the_suite_s_rule(request_of, tmp_pa
     ("changes", "words"),
     [
         ({"backends": ("fake",)}, "two engines"),
-        ({"backends": ("fake", "fake")}, "two engines"),
+        ({"backends": ("fake", "fake")}, "'fake' is named twice"),
         ({"backends": ("fake", "nonsense")}, "unknown backend 'nonsense'"),
         ({"seeds": 1}, "--seeds"),
         ({"levels": (11,)}, "--level"),

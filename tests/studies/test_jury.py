@@ -17,6 +17,7 @@ from gaitgauge.policy.networks.architectures import MlpNetwork
 from gaitgauge.robots import load_robot
 from gaitgauge.studies.consistency import variants
 from gaitgauge.studies.consistency.closed_loop import Cell
+from gaitgauge.studies.consistency.request import ConsistencyError
 from gaitgauge.studies.jury import request as asked
 from gaitgauge.studies.jury import study as judging
 from gaitgauge.studies.jury.page import write_page
@@ -145,6 +146,8 @@ def test_requests_that_no_jury_can_judge(brief, tmp_path):
         judging.prepare_jury(replace(brief, part="shor"))
     with pytest.raises(BackendError, match="unknown backend 'bullet'"):
         judging.prepare_jury(replace(brief, engines=("mujoco", "bullet")))
+    with pytest.raises(ConsistencyError, match="'mujoco' is named twice; name every engine once"):
+        judging.prepare_jury(replace(brief, engines=("mujoco", " mujoco")))
     with pytest.raises(JuryError, match="cannot be judged: "):
         judging.prepare_jury(replace(brief, policies=("missing.gauge.pt",)))
 
