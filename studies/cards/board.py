@@ -32,7 +32,7 @@ from .verify import CardError, check_card, check_policy
 def write_board(folder: Path, page: Path) -> Path:
     """Write the board of a folder's cards, all or nothing, into a folder that is created.
 
-    Cards are ``*.json``, ``*.json.gz`` and folders of evaluations.
+    Cards are ``*.json``, ``*.json.gz`` and folders of evaluations; an evaluation's own folder is a board of one.
 
     Raises:
         CardError: there is no card, one does not hold what it says it holds of a suite that ships, or names such a one and is not
@@ -40,6 +40,8 @@ def write_board(folder: Path, page: Path) -> Path:
         ComparisonError: a file that is none, or a damaged one; nothing is left out in silence.
     """
     files = sorted(file for kind in ("*.json", "*.json.gz", "*/results.json") for file in folder.glob(kind))
+    if folder / "results.json" in files:  # an evaluation also writes down what it was asked
+        files = [file for file in files if file != folder / "request.json"]
     if not files:
         raise CardError(f"'{folder}' holds no score cards; put results.json files or folders of evaluations there")
     cards = {str(file.relative_to(folder)): load_result(file) for file in files}

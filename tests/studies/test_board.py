@@ -136,6 +136,15 @@ def test_a_folder_becomes_a_page_and_what_is_no_card_is_named(tmp_path):
     assert not (tmp_path / "second.html").exists()
 
 
+def test_the_folder_of_one_evaluation_is_a_board_of_one(tmp_path):
+    (tmp_path / "request.json").write_text("{}")
+    with pytest.raises(ComparisonError, match=r"request.json"):
+        write_board(tmp_path, tmp_path / "board.html")
+    (tmp_path / "results.json").write_text(json.dumps(card(0.6)))
+    text = write_board(tmp_path, tmp_path / "board.html").read_text()
+    assert f"gaitgauge verify {tmp_path / 'results.json'}" in text
+
+
 def test_a_card_is_not_written_over(tmp_path):
     (tmp_path / "one.json").write_text(text := json.dumps(card(0.5)))
     done = CliRunner().invoke(app, ["board", str(tmp_path), "--out", str(tmp_path / "one.json")])
