@@ -41,7 +41,12 @@ def standing_pose(survey: Survey, bend: float) -> tuple[dict[int, float], str]:
             )
     for joint, name in names.items():
         if fitting := [word for word in said if fits(word, name)]:
-            angles[joint] = float(said[max(fitting, key=len)])
+            angles[joint] = angle = float(said[max(fitting, key=len)])
+            low, high = survey.model.jnt_range[joint]
+            if survey.model.jnt_limited[joint] and not low <= angle <= high:
+                raise RobotError(
+                    f"the pose has '{name}' at {angle:g} rad, outside its range {low:g} to {high:g} rad; give an angle within it"
+                )
     every = all(any(fits(word, name) for word in said) for name in names.values())
     return angles, "as said" if every else f"as said for {', '.join(said)}; else {origin}"
 

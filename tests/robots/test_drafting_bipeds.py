@@ -138,6 +138,11 @@ def test_legs_that_the_model_s_own_gains_do_not_hold_bent_are_straighter(tmp_pat
     assert next(f for f in examine(robot) if f.check == "load").passed
 
 
+def test_a_pose_beyond_the_range_of_a_joint_is_refused(tmp_path):
+    with pytest.raises(RobotError, match=r"the pose has 'l_d' at -0\.5 rad, outside its range 0 to 2\.4 rad; give"):
+        described(write_biped(tmp_path), pose={"d": 1.0, "l_d": -0.5})
+
+
 def test_guesses_are_made_again_after_an_edit(tmp_path):
     draft, robot = described(write_biped(tmp_path), pose={"d": 0.4, "c": -0.2, "e": -0.2})
     origin = next(e.remark for e in draft.entries if e.key == "default_joint_position")
