@@ -180,7 +180,7 @@ def _draft(path: Path, name: str | None, home: Path, answers: Answers) -> str:
         Entry("title", title),
         Entry("mjcf", path.name),
         Entry("joint_names", names, order),
-        Entry("default_joint_position", joint_table(names, [round(pose[j], 4) for j in joints]), how),
+        Entry("default_joint_position", joint_table(names, [pose[j] for j in joints]), how),
         Entry("base_body", survey.body_name(survey.base)),
         *_feet(survey),
         Entry("collision_bodies", survey.colliding_bodies()),
@@ -309,7 +309,7 @@ def _standing_motors(
 
 def _stance(survey: Survey, pose: Mapping[int, float], joints: list[int], motors: Mapping[str, Remarked]) -> Stance:
     """Return how the robot stands in a pose; two legs are held upright, since they fall over whatever their stiffness."""
-    angles = {survey.model.joint(j).name: round(pose[j], 4) for j in joints}
+    angles = {survey.model.joint(j).name: pose[j] for j in joints}
     constants: dict[str, Any] = {
         key: tuple(np.broadcast_to(value, len(joints)).tolist()) for key, (value, _) in motors.items()
     }

@@ -29,6 +29,7 @@ def standing_pose(survey: Survey, bend: float) -> tuple[dict[int, float], str]:
         bend: of ``BENDS``, for a pose that has to be guessed.
     """
     angles, origin = _unasked_pose(survey, bend)
+    angles = {joint: _short(survey, joint, angle) for joint, angle in angles.items()}
     if not survey.answers.pose:
         return angles, origin
     names = {joint: survey.model.joint(joint).name for joint in survey.hinges}
@@ -104,6 +105,12 @@ def _bounds(survey: Survey, joint: int) -> tuple[float, float]:
     model = survey.model
     low, high = model.jnt_range[joint] if model.jnt_limited[joint] else (-_WIDEST, _WIDEST)
     return float(max(low, -_WIDEST)), float(min(high, _WIDEST))
+
+
+def _short(survey: Survey, joint: int, angle: float) -> float:
+    """Return an angle with four digits, or with all where these lie beyond the joint's range."""
+    low, high = _bounds(survey, joint)
+    return short if low <= (short := round(angle, 4)) <= high else angle
 
 
 def _bent(survey: Survey, leg: Leg, pose: dict[int, float], bend: float) -> dict[int, float]:

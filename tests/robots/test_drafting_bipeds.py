@@ -143,6 +143,15 @@ def test_a_pose_beyond_the_range_of_a_joint_is_refused(tmp_path):
         described(write_biped(tmp_path), pose={"d": 1.0, "l_d": -0.5})
 
 
+def test_a_keyframe_at_the_end_of_a_range_with_many_digits_stays_within_it(tmp_path):
+    """0.5235987 would be 0.5236 with four digits."""
+    pose = STANDING.replace("0 0 -0.2", "0 0.5235987 -0.2")
+    model = write_biped(tmp_path, more=f'<keyframe><key name="home" qpos="{pose}"/></keyframe>')
+    model.write_text(model.read_text().replace('range="-0.5 0.5"', 'range="-0.5235987 0.5235987"'))
+    _, robot = described(model)
+    assert robot.default_joint_position[:3] == (0.0, 0.5235987, -0.2)
+
+
 def test_guesses_are_made_again_after_an_edit(tmp_path):
     draft, robot = described(write_biped(tmp_path), pose={"d": 0.4, "c": -0.2, "e": -0.2})
     origin = next(e.remark for e in draft.entries if e.key == "default_joint_position")
