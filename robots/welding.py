@@ -14,10 +14,11 @@ from .base import JointParameters, Robot
 from .loading import PER_JOINT, RobotError
 
 
-def welded(robot: Robot, folder: Path) -> Robot:
+def welded(robot: Robot, folder: Path, held: Sequence[str] = ()) -> Robot:
     """Return the robot with the joints that no policy drives rigid in its standing pose; the model is written into a folder.
 
-    Masses, shapes and bodies stay. The joints that remain are in the order of ``joint_names``.
+    Masses, shapes and bodies stay. The joints that remain are in the order of ``joint_names``. Those of ``held`` remain too, and motors
+    hold them.
 
     Raises:
         RobotError: such a joint and a driven one move the same body.
@@ -25,14 +26,14 @@ def welded(robot: Robot, folder: Path) -> Robot:
     import mujoco
 
     driven = robot.driven_joints or robot.joint_names
-    kept = [i for i, name in enumerate(robot.joint_names) if name in driven]
+    kept = [i for i, name in enumerate(robot.joint_names) if name in driven or name in held]
     if len(kept) == robot.num_joints:
         return robot
     model, data = default_pose(robot)
     spec = mujoco.MjSpec.from_file(str(robot.mjcf))
     for element in [*spec.actuators, *spec.sensors, *spec.keys]:
         spec.delete(element)  # they may name the joints
-    for name in set(robot.joint_names) - set(driven):
+    for name in set(robot.joint_names) - set(driven) - set(held):
         body = spec.joint(name).parent
         if any(joint.name in driven for joint in body.joints):
             raise RobotError(
@@ -68,6 +69,6 @@ def welded(robot: Robot, folder: Path) -> Robot:
         parameters={name: constants(each) for name, each in robot.parameters.items()},
         velocity_joints=tuple(n for n in robot.velocity_joints or () if n in driven) or None,
         sdk_joint_names=None,
-        driven_joints=None,
+        driven_joints=robot.driven_joints if held else None,
         variants=None,
     )

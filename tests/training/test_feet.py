@@ -16,7 +16,7 @@ from gaitgauge.training.environment.configuration import GaitConfiguration
 from gaitgauge.training.environment.environment import TrainingEnvironment
 from gaitgauge.training.environment.feet import FootReader
 from gaitgauge.training.environment.gait_rewards import pose_weights
-from gaitgauge.training.environment.policy_interface import driven_robot, training_contract
+from gaitgauge.training.environment.policy_interface import driven_robot, joints_of, training_contract
 from gaitgauge.training.environment.reward_configuration import PoseWeights, RewardConfiguration
 from gaitgauge.training.environment.terminations import TERMINATIONS
 from gaitgauge.training.tasks import find_task
@@ -103,12 +103,14 @@ def test_weights_go_by_role():
     assert weights["left_knee_joint"] == 0.0 and weights["waist_pitch_joint"] == 1.0
 
 
-@pytest.mark.parametrize("rigid", [True, False])
-def test_the_walk_holds_arms_and_sees_its_clock(rigid):
-    task = find_task("g1-walk", ["environment.num_envs=2", f"environment.joints.rigid={rigid}", *QUIET])
+@pytest.mark.parametrize(
+    ("settings", "joints"), [("rigid=True", 12), ("rigid=False", 29), ("moving=waist", 15), ("moving=waist_yaw", 13)]
+)
+def test_the_walk_holds_arms_and_sees_its_clock(settings, joints):
+    task = find_task("g1-walk", ["environment.num_envs=2", f"environment.joints.{settings}", *QUIET])
     env = TrainingEnvironment(task.environment, backend="mujoco", device="cpu")
     try:
-        assert env.backend.state.joint_position.shape == (2, 12 if rigid else 29)
+        assert env.backend.state.joint_position.shape == (2, joints)
         assert env.num_actions == 12 and env.contract.joint_names == G1.joint_names[:12]
         assert [joint.name for joint in env.contract.held] == list(G1.joint_names[12:])
         with pytest.raises(ExportError, match="this policy leaves 17 to be held, as 'waist_yaw_joint'"):
@@ -143,6 +145,8 @@ def test_wrong_settings():
         ConfigurationError, match=r"driven has 'tail', a role of no joint of robot 'g1'; its joints are: hip_"
     ):
         driven_robot(G1, find_task("g1-walk", ["environment.joints.driven=hip,tail"]).environment)
+    with pytest.raises(ConfigurationError, match=r"moving has 'tail', a role of no joint of robot 'g1'"):
+        joints_of(G1, ("waist", "tail"), "moving")
     with pytest.raises(ConfigurationError, match="offsets has 3 entries; robot 'g1' has 2 feet"):
         reader(period=0.5, offsets=(0.0, 0.2, 0.4))
     assert driven_robot(G1, walk).driven_joints == G1.joint_names[:12]

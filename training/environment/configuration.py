@@ -75,6 +75,9 @@ class JointConfiguration:
     the robot's own choice, all joints where its description says nothing."""
     rigid: bool = False
     """Make the joints that the policy does not drive rigid in the training physics, which has fewer degrees of freedom then."""
+    moving: tuple[str, ...] = ()
+    """Roles of joints, or their beginnings (``waist``), that ``rigid`` leaves to the motors that hold them. On a waist that gives way the
+    pelvis of a G1 sways about its yaw axis with each step; a policy that learns with a rigid waist never sees that."""
 
 
 @dataclass(frozen=True, kw_only=True)

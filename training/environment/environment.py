@@ -35,7 +35,7 @@ from .events import EpisodeStart
 from .memory import copied, fitting, restore
 from .observations import Observations
 from .own_terms import resolve_own
-from .policy_interface import driven_robot, joint_parameters, training_contract
+from .policy_interface import driven_robot, joint_parameters, joints_of, training_contract
 from .scenarios import read_scenarios, with_scenarios
 from .step import EnvironmentStep, StepResult
 from .step_inputs import AFTER_RESET, AFTER_STEP, static_inputs
@@ -102,7 +102,8 @@ class TrainingEnvironment(VecEnv):
         whole = driven_robot(described, configuration)
         check_stretches(configuration, whole, self.contract)
         self._model_folder = TemporaryDirectory(prefix="gaitgauge-robot-") if configuration.joints.rigid else None
-        self.robot = whole if self._model_folder is None else welded(whole, Path(self._model_folder.name))
+        moving = joints_of(whole, configuration.joints.moving, "moving")
+        self.robot = whole if self._model_folder is None else welded(whole, Path(self._model_folder.name), moving)
         self._parameters = joint_parameters(self.robot, configuration)
         self.num_envs = configuration.num_envs
         self.num_actions = self.contract.num_joints

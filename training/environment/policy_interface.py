@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -27,19 +28,25 @@ _log = logging.getLogger(__name__)
 
 def driven_robot(robot: Robot, configuration: EnvironmentConfiguration) -> Robot:
     """Return the robot with the driven joints that ``joints.driven`` asks for. Raises ConfigurationError: a role that no joint has."""
-    roles = configuration.joints.driven
+    names = joints_of(robot, configuration.joints.driven, "driven")
+    return replace(robot, driven_joints=names) if names else robot
+
+
+def joints_of(robot: Robot, roles: Sequence[str], setting: str) -> tuple[str, ...]:
+    """Return the names of a robot's joints of some roles, which ``joints.<setting>`` asks for. Raises ConfigurationError: a role that no
+    joint has.
+    """
     if not roles:
-        return robot
+        return ()
     build = anatomy(robot)
     for role in roles:
         if not build.joints(role):
             raise ConfigurationError(
-                f"environment.joints.driven has {shown(role)}, a role of no joint of robot '{robot.name}'; its joints are: "
+                f"environment.joints.{setting} has {shown(role)}, a role of no joint of robot '{robot.name}'; its joints are: "
                 f"{', '.join(dict.fromkeys(build.roles))}"
             )
-    driven = {i for role in roles for i in build.joints(role)}
-    names = tuple(name for i, name in enumerate(robot.joint_names) if i in driven)
-    return replace(robot, driven_joints=names)
+    chosen = {i for role in roles for i in build.joints(role)}
+    return tuple(name for i, name in enumerate(robot.joint_names) if i in chosen)
 
 
 def joint_parameters(robot: Robot, configuration: EnvironmentConfiguration) -> JointParameters:
