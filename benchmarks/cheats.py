@@ -13,9 +13,12 @@ plays the other two thirds too. The ten best over all places are played again on
 rounds leave the test as it is and cost half of a full screen; ``--by-thirds`` prints how well gains on a third of the places tell
 those on the other two thirds, among all filters that the folder has whole, and how many of the ten best a first round would lose.
 
+A sub-command that a filter does not change is not played again: it gets the unfiltered policy's samples, to the last bit the same,
+since each begins with a reset and has noise of its own. So a filter that changes nothing gains exactly 0.
+
 At every terrain and friction the lower bound of a listed cheat must be at most 0, or 0.002 where the unfiltered policy falls; that of a
 random filter must be at most 0. Else the exit code is 1. What the folder holds is not played again. 200 filters take about 2,100
-episodes for the screen and 4,600 for the fresh seeds, 4 to 9 s of a core each.
+episodes for the screen and 4,600 for the fresh seeds, 4 to 9 s of a core each where every sub-command is played.
 """
 
 from __future__ import annotations
@@ -34,10 +37,11 @@ from typing import Any
 import numpy as np
 import torch
 from gaitgauge.backends import make_backend
-from gaitgauge.gauge.episodes import QUALITY, Episode
+from gaitgauge.gauge.episodes import MOTION, QUALITY, Episode, Record
 from gaitgauge.gauge.evaluate import Prepared, Request, prepare
 from gaitgauge.gauge.goals import TARGET
 from gaitgauge.gauge.play.rollout import Rollout
+from gaitgauge.gauge.play.segments import SegmentOutcome, count_segments
 from gaitgauge.gauge.play.workers import Job
 from gaitgauge.gauge.scoring import level_score, run_statistics
 from gaitgauge.policy.observation import ObservationBuilder
@@ -46,14 +50,16 @@ from scipy import special
 FRICTIONS = (0.3, 0.6, 0.9)
 _FRESH, _SCREEN = 9000, 8000
 """First of the fresh seeds, and the seed of the screen."""
-_CHUNK = 5
-"""Seeds of one job."""
+_CHUNK = 2
+"""Seeds of one job: few, so that no core idles for long at the end."""
 _LISTED_SEEDS, _BEST = 5, 10
 _KEPT = 4
 """One filter of so many plays the second round of the screen."""
 _ALLOWED = 0.002
 """Lower bound that a gain may have where the unfiltered policy falls."""
 _MEAN50 = 2
+Goals = dict[tuple[int, int], SegmentOutcome]
+"""Outcomes of the sub-commands of one episode, by goal and sub-command."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -200,8 +206,12 @@ class Scores:
         return sum(self.found["none", terrain, friction, s][1] for s in seeds)
 
 
-def play(prepared: Prepared, level: int, wanted: Play) -> list[list[Any]]:
-    """Play a job in this process; returns friction, seed, score and falls of each episode."""
+def play(prepared: Prepared, level: int, wanted: Play, folder: Path | None = None) -> list[list[Any]]:
+    """Play a job in this process; returns friction, seed, score and falls of each episode.
+
+    Args:
+        folder: the unfiltered policy's samples are written there, and other filters take them; None to play every sub-command.
+    """
     torch.set_num_threads(1)
     suite, flat = prepared.suite, wanted.terrain == "flat"
     level = 0 if flat else level
@@ -216,18 +226,22 @@ def play(prepared: Prepared, level: int, wanted: Play) -> list[list[Any]]:
         policy=prepared.policy,
         robot=prepared.robot,
         places=((wanted.terrain, level),),
-        worlds=42,
+        worlds=min(42, sum(count_segments(episode, suite) for episode in episodes)),
         build=lambda scene, **options: make_backend(prepared.request.backend, scene, device="cpu", **options),
     )
     rollout = job.rollout()
     _filter_commands(rollout, wanted.change, suite.physics.control_period)
     rollout.play(episodes)
+    records = _take_unfiltered(rollout, wanted.change, folder) if folder is not None and wanted.change != NONE else []
     found = []
-    while not rollout.idle:
-        for record in rollout.advance():
+    while records or not rollout.idle:
+        for record in records or rollout.advance():
+            if folder is not None and wanted.change == NONE:
+                write_samples(unfiltered_path(folder, record.episode), record)
             quality = run_statistics(record, record.columns.index(QUALITY))[_MEAN50]
             score = float(level_score(float(quality), level, suite.scoring, flat=flat))
             found.append([record.episode.friction, record.episode.seed, score, record.falls])
+        records = []
     rollout.backend.close()
     return found
 
@@ -237,12 +251,80 @@ def _filter_commands(rollout: Rollout, change: Filter, period: float) -> None:
     step.builder = FilteredBuilder(step.builder, change, period)
 
 
+def changes(change: Filter, commands: torch.Tensor, period: float) -> bool:
+    """Return whether a filter may change one of a sub-command's commands, (T, 3)."""
+    if change.lag or change.stand or round(change.delay / period):
+        return True
+    cap = torch.tensor(change.cap)
+    return not torch.equal(torch.clamp(commands * torch.tensor(change.scale), -cap, cap), commands)
+
+
+def _take_unfiltered(rollout: Rollout, change: Filter, folder: Path) -> list[Record]:
+    """Give the rollout what the unfiltered policy did in sub-commands that a filter does not change; returns complete records."""
+    queue: Any = rollout._queue
+    suite, schedule, rules = rollout.suite, rollout._step.schedule, rollout._step.rules
+    assert not (rules.fall_closes_goal or rules.restarts)  # else a sub-command could end the next one
+    limits = torch.tensor(suite.command_limits(rollout.backend.scene.terrains[0].family), dtype=torch.float32)
+    period = suite.physics.control_period
+    same = {
+        (goal, part): bool(commands)
+        and not changes(change, torch.tensor(commands, dtype=torch.float32) * limits, period)
+        for goal, parts in schedule.sub_commands.items()
+        for part, commands in enumerate(parts)
+    }
+    taken, records = set(), []
+    for episode, opened in list(queue._open.items()):
+        held = read_samples(unfiltered_path(folder, episode), queue._columns)
+        for segment in opened.started:
+            outcome = held.get((segment.goal_index, segment.sub_command))
+            if outcome is not None and same[segment.goal, segment.sub_command]:
+                opened.outcomes[segment] = outcome
+                taken.add(segment)
+        if not opened.missing():
+            records.append(queue._open.pop(episode).record(queue._columns))
+    queue._waiting = type(queue._waiting)(segment for segment in queue._waiting if segment not in taken)
+    return records
+
+
+def unfiltered_path(folder: Path, episode: Episode) -> Path:
+    """Return the file with the samples of an unfiltered episode."""
+    return folder / f"unfiltered {episode.terrain} {episode.friction:g} {episode.seed}.npz"
+
+
+def write_samples(path: Path, record: Record) -> None:
+    """Write the samples that an episode's score is made of."""
+    with path.open("wb") as file:
+        np.savez_compressed(
+            file,
+            samples=record.samples[:, [record.columns.index(name) for name in (QUALITY, MOTION)]],
+            parts=np.stack((record.goal_index, record.part_index), axis=1),
+            fallen=np.array(record.fallen, dtype=np.int64).reshape(-1, 2),
+        )
+
+
+def read_samples(path: Path, columns: Sequence[str]) -> Goals:
+    """Read what ``write_samples`` wrote, as outcomes with all columns; those that a score does not need are NaN."""
+    with np.load(path) as file:
+        samples, parts, fallen = file["samples"], file["parts"], file["fallen"]
+    wide = np.full((len(samples), len(columns)), np.nan, dtype=np.float32)
+    wide[:, [columns.index(QUALITY), columns.index(MOTION)]] = samples
+    found: Goals = {}
+    for goal, part in np.unique(parts, axis=0).tolist():
+        mine = (parts == (goal, part)).all(1)
+        falls = int((fallen == (goal, part)).all(1).sum())
+        touching = np.zeros(int(mine.sum()), dtype=np.bool_)
+        found[goal, part] = SegmentOutcome(
+            samples=wide[mine], touching=touching, control_steps=0, physics_steps=0, falls=falls
+        )
+    return found
+
+
 _shared: dict[str, Any] = {}
 """What forked processes have from their parent."""
 
 
 def _play_shared(wanted: Play) -> tuple[Play, list[list[Any]]]:
-    return wanted, play(_shared["prepared"], _shared["level"], wanted)
+    return wanted, play(_shared["prepared"], _shared["level"], wanted, _shared["folder"])
 
 
 def play_all(wanted: Sequence[Play], folder: Path, threads: int, scores: Scores) -> None:
@@ -408,7 +490,7 @@ def main() -> int:
     if stamp.exists() and stamp.read_text() != identity:
         parser.error(f"--folder {arguments.folder} holds another policy, suite or level; choose another folder")
     stamp.write_text(identity)
-    _shared.update(prepared=prepared, level=arguments.level)
+    _shared.update(prepared=prepared, level=arguments.level, folder=arguments.folder)
     terrains = arguments.terrain or list(prepared.suite.matrix.terrains)
     fresh = [_FRESH + s for s in range(max(arguments.fresh, arguments.listed))]
     frictions = tuple(arguments.friction or FRICTIONS)
@@ -427,20 +509,22 @@ def main() -> int:
     if arguments.by_thirds:
         judge_screen(scores, terrains, held_whole(arguments.folder, scores, terrains))
         return 0
-    play_these(plays([NONE, *LISTED], few))
+    screen = [_SCREEN] if arguments.filters else []
+    play_these(plays([NONE], screen) + plays([NONE], fresh if arguments.filters else few))
+    play_these(plays(LISTED, few))
     kept = judge_listed(scores, terrains, few)
     candidates = [random_filter(index) for index in range(arguments.filters)]
     if candidates:
         first = {t: (f,) for t, f in thirds(terrains, frictions, 0)}
         others = {t: tuple(f for f in frictions if f not in first[t]) for t in terrains}
-        play_these(plays([NONE, *candidates], [_SCREEN], first) + plays([NONE], [_SCREEN], others))
+        play_these(plays(candidates, [_SCREEN], first))
         gains = {c.name: scores.third(c.name, terrains, 0, _SCREEN) for c in candidates}
         most = max(_BEST, -(-len(candidates) // _KEPT))
         promising = sorted(candidates, key=lambda c: -gains[c.name])[:most]
         play_these(plays(promising, [_SCREEN], others))
         screened = {c.name: float(scores.gains(c.name, terrains, [_SCREEN])[0]) for c in promising}
         best = dict(sorted(screened.items(), key=lambda item: -item[1])[:_BEST])
-        play_these(plays([NONE, *(random_filter(_number(name)) for name in best)], fresh[: arguments.fresh]))
+        play_these(plays([random_filter(_number(name)) for name in best], fresh[: arguments.fresh]))
         kept &= judge_random(scores, terrains, best, fresh[: arguments.fresh])
         print(
             f"\nof {len(candidates)} random filters {sum(g > 0 for g in gains.values())} gained in the first round of the screen,"

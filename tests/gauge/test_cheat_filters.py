@@ -82,10 +82,34 @@ def test_a_listed_cheat_that_gains_somewhere_is_found(capsys):
     assert "0.3 s later" in capsys.readouterr().out
 
 
+def test_a_filter_changes_the_sub_commands_that_it_touches():
+    turn, walk = torch.tensor([[0.0, 0.0, 1.5]] * 3), torch.tensor([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])
+    slow_turn = Filter(name="", cap=(1.0, 1.0, 1.0))
+    assert cheats.changes(slow_turn, turn, 0.02) and not cheats.changes(slow_turn, walk, 0.02)
+    assert not cheats.changes(Filter(name="", delay=0.009), walk, 0.02)  # less than half a step
+    for change in (Filter(name="", delay=0.02), Filter(name="", lag=0.001), Filter(name="", walk=1.0, stand=0.1)):
+        assert cheats.changes(change, walk, 0.02)
+
+
+@pytest.mark.slow
+def test_sub_commands_that_a_filter_does_not_change_score_as_if_they_were_played(tmp_path):
+    prepared = cheats.prepare(
+        cheats.Request(policy="pretrained", suite="gaitgauge-1", frictions=(0.6,), payloads=(0.0,))
+    )
+
+    def play(change, folder):
+        return cheats.play(prepared, 5, Play(change=change, terrain="flat", seeds=(1,), frictions=(0.3,)), folder)
+
+    unfiltered = play(cheats.NONE, tmp_path)
+    sideways = Filter(name="", cap=(math.inf, 0.7, math.inf))
+    assert play(sideways, tmp_path) == play(sideways, None) != unfiltered
+    assert play(Filter(name="", cap=(2.0, 1.0, 2.0)), tmp_path) == unfiltered
+
+
 def test_jobs_that_have_ended_are_not_played_again(tmp_path, monkeypatch):
     played = []
 
-    def play(prepared, level, wanted):
+    def play(prepared, level, wanted, folder):
         played.append(wanted.key)
         return [[f, s, 0.5, 0] for f in cheats.FRICTIONS for s in wanted.seeds]
 
@@ -100,17 +124,17 @@ def test_jobs_that_have_ended_are_not_played_again(tmp_path, monkeypatch):
 
     monkeypatch.setattr(cheats, "play", play)
     monkeypatch.setattr(cheats.multiprocessing, "get_context", lambda _: type("Context", (), {"Pool": Pool}))
-    monkeypatch.setattr(cheats, "_shared", {"prepared": None, "level": 5})
+    monkeypatch.setattr(cheats, "_shared", {"prepared": None, "level": 5, "folder": tmp_path})
     jobs = [Play(change=cheats.NONE, terrain="flat", seeds=some) for some in cheats.chunks(range(8))]
     cheats.play_all(jobs[:1], tmp_path, 1, Scores())
     with (tmp_path / "played.jsonl").open("a") as file:
         file.write('{"key": "none | fl')  # killed while it wrote
     scores = Scores()
     cheats.play_all(jobs, tmp_path, 1, scores)
-    assert played == ["none | flat 0.3,0.6,0.9 | 0-4", "none | flat 0.3,0.6,0.9 | 5-7"]
+    assert played == [f"none | flat 0.3,0.6,0.9 | {first}-{first + 1}" for first in range(0, 8, 2)]
     assert len(scores.found) == 3 * 8
     cheats.play_all(jobs, tmp_path, 1, scores)
-    assert len(played) == 2
+    assert len(played) == 4
 
 
 def test_the_thirds_of_a_screen_are_all_places_once():
