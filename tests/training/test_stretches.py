@@ -214,13 +214,15 @@ RECORDED = {
 each, the last for all others; seconds to build the last stretch; seconds for an iteration of it. The last two are invented."""
 
 
+@pytest.mark.parametrize("done", [0.0, 0.3])
 @pytest.mark.parametrize("recorded", RECORDED.values(), ids=RECORDED)
-def test_a_fitted_run_ends_between_96_and_99_percent_of_its_time(recorded, monkeypatch):
+def test_a_fitted_run_ends_between_96_and_99_percent_of_its_time(recorded, done, monkeypatch):
+    """Also a run that begins where ``done`` of its schedules counts as done."""
     starting, first, building, last = recorded
     times = [seconds for count, seconds in first for _ in range(count)]
     clock, steps, begin = starting, 24, 0.6
     monkeypatch.setattr(fitting, "time", SimpleNamespace(monotonic=lambda: clock))
-    schedule = ScheduleConfiguration(stretches=(replace(LAST, begin=begin),))
+    schedule = ScheduleConfiguration(begin=done, stretches=(replace(LAST, begin=begin),))
     env = SimpleNamespace(
         stretch=0, cfg=SimpleNamespace(schedule=schedule), set_horizon=lambda steps: horizons.append(steps)
     )
@@ -232,13 +234,27 @@ def test_a_fitted_run_ends_between_96_and_99_percent_of_its_time(recorded, monke
         clock += last if env.stretch else times[min(run.iteration, len(times) - 1)]
         run.iteration += 1
         total = fit.total(total, 1200.0 - clock)
-        reached = run.iteration * steps >= round(begin * total * steps)
+        reached = run.iteration * steps >= round(begin * total * steps) - round(done * total * steps)
         assert reached or not env.stretch, "the stretch lies ahead again"
         if reached and not env.stretch:
             env.stretch, entered, clock = 1, run.iteration, clock + building
     assert 0.96 * 1200 <= clock <= 0.99 * 1200
     assert horizons[-1] == total * steps == run.settings["environment"]["schedule"]["horizon_steps"]
-    assert begin - 0.02 <= entered / total <= (begin + 0.02 if building < 100 else 0.75)
+    assert begin - 0.02 <= done + entered / total <= (begin + 0.02 if building < 100 else 0.75)
+
+
+def test_schedules_of_a_run_that_begins_within_them_are_spread_from_there():
+    schedule = ScheduleConfiguration(
+        horizon_steps=40, begin=0.25, stretches=(LAST, replace(LAST, name="never", begin=1.0))
+    )
+    env = make(num_envs=4, terrain=STAIRS, schedule=schedule)
+    idle(env, 2)
+    env.set_horizon(16)
+    assert float(env.progress) == pytest.approx(0.25 + 2 / 16) and not env.stretch_ends
+    idle(env, 2)
+    assert float(env.progress) == pytest.approx(0.5) and env.next_stretch() == LAST
+    idle(env, 9)
+    assert not env.stretch_ends, "a stretch at 1 never begins"
 
 
 def test_a_run_fits_its_schedules_into_the_time(tmp_path, monkeypatch):

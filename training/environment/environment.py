@@ -328,12 +328,15 @@ class TrainingEnvironment(VecEnv):
     # --- stretches --------------------------------------------------------------------------------------------------
 
     def set_horizon(self, steps: int) -> None:
-        """Spread the schedules over another number of environment steps of the whole run."""
+        """Spread the schedules over another number of environment steps of the whole run, which begins at the same fraction of it."""
         self._given, self.configuration = (
             replace(each, schedule=replace(each.schedule, horizon_steps=steps))
             for each in (self._given, self.configuration)
         )
         self.cfg = self.configuration
+        first = round(self._given.schedule.begin * steps)
+        self.parts.memory.step.add_(first - self._first_step)
+        self._first_step = first
         self.parts.rate.fill_(1.0 / steps)
 
     @property

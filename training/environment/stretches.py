@@ -26,7 +26,8 @@ class _Settings:
 
 def stretch_at(schedule: ScheduleConfiguration, step: int) -> int:
     """Return how many stretches have begun after a number of environment steps of the run."""
-    return sum(step >= round(stretch.begin * schedule.horizon_steps) for stretch in schedule.stretches)
+    begins = [stretch.begin for stretch in schedule.stretches if stretch.begin < 1.0]
+    return sum(step >= round(begin * schedule.horizon_steps) for begin in begins)
 
 
 def settings_in(configuration: EnvironmentConfiguration, stretch: int) -> EnvironmentConfiguration:

@@ -31,7 +31,7 @@ def iterations_that_fit(*, done: int, each: float, left: float, begins: Sequence
         done: iterations done.
         each: time of one [s].
         left: time to fill [s].
-        begins: fractions of the run at which stretches are still to begin.
+        begins: fractions of these iterations after which stretches are still to begin.
     """
     first = min(begins, default=1.0)
     seconds = left - BUILDING * len(begins)
@@ -60,11 +60,13 @@ class Fit:
         if run.iteration != self._until:
             return total
         each = (now - self._begin) / (self._until - self._from)
-        stretches = env.cfg.schedule.stretches
-        begins = [stretch.begin for stretch in stretches[env.stretch :] if stretch.begin < 1.0]
-        fitting = iterations_that_fit(done=run.iteration, each=each, left=left - self._spare, begins=begins)
+        schedule = env.cfg.schedule
+        begins = [stretch.begin - schedule.begin for stretch in schedule.stretches if stretch.begin < 1.0]
+        fitting = iterations_that_fit(
+            done=run.iteration, each=each, left=left - self._spare, begins=begins[env.stretch :]
+        )
         if env.stretch > self._first:  # one that has begun must not lie ahead again
-            fitting = min(fitting, int(run.iteration / stretches[env.stretch - 1].begin))
+            fitting = min(fitting, int(run.iteration / begins[env.stretch - 1]))
         fitted = min(run.processes.firsts(fitting), self._longest)
         self._from, self._until, self._begin = run.iteration, run.iteration + max(round(EVERY * fitted), MEASURED), now
         if abs(fitted - total) > CHANGE * total:
