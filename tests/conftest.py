@@ -30,6 +30,17 @@ os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (_FAKE_ENGINE, os.enviro
 gc.disable()  # until all is imported: most of it stays
 
 
+class _Checkout:
+    @pytest.hookimpl(tryfirst=True)
+    def pytest_collect_directory(self, path: Path, parent: pytest.Collector) -> pytest.Collector | None:
+        """Take the checkout for a folder of tests; it is the package itself."""
+        return pytest.Dir.from_parent(parent, path=path) if path == Path(__file__).parents[1] else None
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    config.pluginmanager.register(_Checkout())
+
+
 def pytest_collection_finish() -> None:
     """Leave what was imported out of every search for garbage, without a first search, which would take a second."""
     gc.freeze()

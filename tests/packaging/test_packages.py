@@ -46,6 +46,11 @@ def imported() -> dict[str, str]:
     return found
 
 
+def test_the_checkout_is_no_package_of_tests(request):
+    """Pytest would import its ``__init__.py`` by the folder's name, which a folder with a dash in its name does not survive."""
+    assert not [node for node in request.node.listchain() if isinstance(node, pytest.Package)]
+
+
 def test_what_is_imported_is_asked_for_and_nothing_else():
     listed, extras = project()["project"]["dependencies"], project()["project"]["optional-dependencies"]
     asked = {distribution(text) for text in listed}
