@@ -14,17 +14,15 @@ from rich.text import Text
 
 from ..gauge.coverage import notes, score_label, suite_label
 from ..gauge.evaluate import Status, evaluate, identity, prepare
-from ..gauge.metric_rules import GO2_LEG, GO2_MASS
 from ..gauge.report.page import FELL_AT_LIMIT, falls_at_limit, write_report
 from ..gauge.report.references import comparable, references_for
 from ..gauge.request import Request
 from ..gauge.result import Result
 from ..gauge.results import ALL
 from ..gauge.suite import Suite
+from ..gauge.suited import other_measure
 from ..policy.contract import PolicyContract
 from ..policy.foreign.adapters import AT_ONCE, doubt
-from ..robots.anatomy.body_plan import body_plan
-from ..robots.base import Robot
 from ..studies.naming import free_run_folder, run_folders
 from .clip import FilmTime
 from .console import Terminal, make_table, print_json
@@ -79,18 +77,6 @@ def _film(display: ProgressDisplay, seconds: float, folder: Path, request: Reque
     options += ["--contract", request.contract] if request.contract else []
     display.update(1.0, "filming the robot", left=seconds)
     return make_clip(folder, result, options)
-
-
-def other_measure(suite: Suite, robot: Robot) -> str | None:
-    """Return what a suite of fixed measure does to a robot far larger or smaller than a Go2, None where it does nothing."""
-    plan = body_plan(robot)
-    times = plan.mass * plan.leg_length / (GO2_MASS * GO2_LEG)
-    if suite.metrics.measure == "robot" or 0.5 <= times <= 2.0:
-        return None
-    return (
-        f"{suite.name} judges torque and power as a Go2's, and weight times leg length of '{robot.name}' is {times:.2g} times a Go2's: "
-        "dof_power and torque_smoothness say little here; gaitgauge-1 judges them in the robot's own measure"
-    )
 
 
 def doubtful_assumptions(contract: PolicyContract, suite: Suite, folder: Path, *, within: bool = True) -> str | None:

@@ -8,8 +8,10 @@ from typing import Literal
 
 from ..policy.contract import PolicyContract
 from ..robots import Robot
+from ..robots.anatomy.body_plan import body_plan
 from .commands import Command
 from .ground_rules import longer
+from .metric_rules import GO2_LEG, GO2_MASS
 from .suite import Commands, Suite, SuiteError
 
 Axis = Literal["forward", "lateral", "yaw"]
@@ -60,6 +62,18 @@ def measured(suite: Suite, robot: Robot) -> Suite:
         suite,
         commands=replace(suite.commands, target_radius=radius),
         written=suite if suite.written is None else suite.written,
+    )
+
+
+def other_measure(suite: Suite, robot: Robot) -> str | None:
+    """Return what a suite of fixed measure does to a robot far larger or smaller than a Go2, None where it does nothing."""
+    plan = body_plan(robot)
+    times = plan.mass * plan.leg_length / (GO2_MASS * GO2_LEG)
+    if suite.metrics.measure == "robot" or 0.5 <= times <= 2.0:
+        return None
+    return (
+        f"{suite.name} judges torque and power as a Go2's, and weight times leg length of '{robot.name}' is {times:.2g} times a Go2's: "
+        "dof_power and torque_smoothness say little here; gaitgauge-1 judges them in the robot's own measure"
     )
 
 

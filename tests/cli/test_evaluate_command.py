@@ -6,11 +6,10 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from gaitgauge.cli.evaluate import doubtful_assumptions, other_measure, print_results
+from gaitgauge.cli.evaluate import doubtful_assumptions, print_results
 from gaitgauge.gauge.result import Health, read_result
 from gaitgauge.gauge.store import StoreError
 from gaitgauge.gauge.suite import load_suite
-from gaitgauge.robots import load_robot
 from tiny_suite import SUITE
 
 
@@ -110,14 +109,3 @@ def test_assumptions_are_repeated_where_the_robot_falls_at_once(tmp_path, contra
     assert "taken for granted" not in said(contract, falling)  # nothing was guessed
     asked = doubtful_assumptions(guessed, suite, tmp_path, within=False)
     assert "commands more than the policy was made for" in asked and "doctor" not in asked
-
-
-@pytest.mark.parametrize(
-    ("suite", "robot", "said"),
-    [("robogauge-1.1.8", "anymal_c", True), ("robogauge-1.1.8", "go1", False), ("gaitgauge-1", "anymal_c", False)],
-)
-def test_a_suite_of_fixed_measure_says_what_it_does_to_a_heavy_robot(suite, robot, said):
-    sentence = other_measure(load_suite(suite), load_robot(robot))
-    assert bool(sentence) == said
-    if sentence:
-        assert sentence.startswith("robogauge-1.1.8 judges torque and power as a Go2's") and "gaitgauge-1" in sentence

@@ -9,7 +9,7 @@ import pytest
 from gaitgauge.gauge.coverage import coverage, notes
 from gaitgauge.gauge.pipelines import make_environments
 from gaitgauge.gauge.suite import Suite, SuiteError, load_suite
-from gaitgauge.gauge.suited import beyond_in_words, changes, shares_beyond, suited
+from gaitgauge.gauge.suited import beyond_in_words, changes, other_measure, shares_beyond, suited
 from gaitgauge.policy.contract import PolicyContract, standard_contract
 from gaitgauge.robots import load_robot
 from sample_results import sample
@@ -98,3 +98,14 @@ def test_notes_say_what_was_asked_beyond_the_limits():
     result = sample()
     beyond = replace(result.commands, limits=(1.0, 0.4, 1.0), beyond={"forward": 0.5})
     assert any("50 % of the commands forward" in note for note in notes(replace(result, commands=beyond)))
+
+
+@pytest.mark.parametrize(
+    ("suite", "robot", "said"),
+    [("robogauge-1.1.8", "anymal_c", True), ("robogauge-1.1.8", "go1", False), ("gaitgauge-1", "anymal_c", False)],
+)
+def test_a_suite_of_fixed_measure_says_what_it_does_to_a_heavy_robot(suite, robot, said):
+    sentence = other_measure(load_suite(suite), load_robot(robot))
+    assert bool(sentence) == said
+    if sentence:
+        assert sentence.startswith("robogauge-1.1.8 judges torque and power as a Go2's") and "gaitgauge-1" in sentence
