@@ -27,7 +27,7 @@ def described_contract(path: Path, asked: Robot | None) -> PolicyContract:
     source = f"contract file '{path}'"
     data = parse_toml(read_text(path, "contract file", PolicyError), source, PolicyError)
     named = data.get("robot")
-    robot = choose_robot(asked, named if asked is None and isinstance(named, str) else None, path)
+    robot = choose_robot(asked, named if isinstance(named, str) else None, path)
     return contract_of(data, robot, source, {"adapter": "contract.toml", "file": path.name})
 
 

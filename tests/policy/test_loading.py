@@ -207,6 +207,15 @@ def test_what_a_contract_file_leaves_out_goes_with_its_joints(tmp_path, go2):
     assert described_contract(described, go2).default_joint_position == (0.1,) * 12
 
 
+def test_a_contract_file_of_another_robot_is_refused(tmp_path, go2):
+    """A Go1 has the Go2's joints, and was played with its standard gains and pose."""
+    described = tmp_path / "contract.toml"
+    described.write_text('robot = "go1"')
+    with pytest.raises(PolicyError, match=r"describes a policy for robot 'go1', not for 'go2'; give that robot's"):
+        described_contract(described, go2)
+    assert described_contract(described, load_robot("go1")).robot == "go1"
+
+
 @pytest.mark.parametrize("joints", ['["a", "b"]', '["a", 1]', "3", '["FL_hip_joint"]', "{ a = 1 }"])
 def test_joints_that_are_not_the_robots_are_refused(tmp_path, go2, joints):
     described = tmp_path / "contract.toml"
