@@ -1,11 +1,12 @@
 """Forge a score card in many ways, and print which forgeries the board and the judge of ``verify`` refuse.
 
-    python benchmarks/forgeries.py CARD.json.gz
+    python benchmarks/forgeries.py CARD.json.gz [--policy FILE]
 
 The card must be an honest one of a suite that ships. Each kind of forgery is made from it and tried on ``gaitgauge board`` and on
 ``gaitgauge verify``, where the card itself stands for the replay: nothing is played. Kinds whose figures were all made anew
-(``consistent``) contradict nothing in the card, so that only a replay tells them; the board cannot. Exit code 1 where the judge
-accepts a forgery, or the board one that contradicts itself.
+(``consistent``) contradict nothing in the card, so that only a replay tells them; the board cannot. Nor can it tell what is false
+of a policy that is not here: it marks such a card, as it marks the honest one (``unseen``). ``--policy`` puts the file of a policy
+that does not ship beside the card. Exit code 1 where the judge accepts a forgery, or the board one that it could tell.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import argparse
 import copy
 import gzip
 import json
+import shutil
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
@@ -33,6 +35,7 @@ Forger = Callable[[Data], Data | None]
 """Changes a card in place, or returns another one."""
 REPLAY = "consistent"
 MARKED = "marked"
+UNSEEN = "it is marked: policy unseen"
 KINDS: dict[str, Forger] = {}
 
 
@@ -664,13 +667,13 @@ def downgraded(card: Data) -> Data:
 
 
 def try_board(card: Data, folder: Path) -> str | None:
-    """Return the sentence with which the board refuses a card, None where it shows it as a proved one."""
+    """Return the sentence with which the board refuses or marks a card, None where it shows it as a proved one."""
     (folder / "card.json").write_text(json.dumps(card))
     try:
-        page = write_board(folder, folder / "board.html")
+        page = write_board(folder, folder / "board.html").read_text()
     except ValueError as error:
         return str(error)
-    return "it is marked as unproved" if ">unproved<" in page.read_text() else None
+    return "it is marked as unproved" if ">unproved<" in page else UNSEEN if ">policy unseen<" in page else None
 
 
 def try_judge(card: Data, honest: Result, folder: Path) -> str | None:
@@ -720,6 +723,7 @@ def main() -> None:
     """Forge, try, print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("card", type=Path)
+    parser.add_argument("--policy", type=Path, help="the file of a policy that does not ship")
     parser.add_argument("--only", default="", help="kinds with this text in their name")
     parser.add_argument("--sentences", action="store_true", help="say why, too")
     arguments = parser.parse_args()
@@ -728,20 +732,29 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder)
         load_result(arguments.card)
-        if refused := try_board(card, place):
-            sys.exit(f"the honest card is refused: {refused}")
-        accepted, count = [], 0
+        if arguments.policy:
+            shutil.copyfile(arguments.policy, place / Path(card["policy"]["path"]).name)
+        honest = try_board(card, place)
+        if honest not in (None, UNSEEN) or (arguments.policy and honest):
+            sys.exit(f"the honest card is refused: {honest}")
+        accepted, unseen, count = [], [], 0
         print(f"{'forgery':56}  {'board':11}  judge")
         for name, board, judged in tried(card, place, arguments.only):
             count += 1
             needs_replay = name.startswith(REPLAY)
             if judged is None or (board is None and not needs_replay):
                 accepted.append(name)
-            told = "refused" if board else "cannot tell" if needs_replay else "ACCEPTED"
+            if board == UNSEEN and not needs_replay and judged:
+                unseen.append(name)
+            marked = UNSEEN.rpartition(" ")[2] if board == UNSEEN else "refused"
+            told = "cannot tell" if needs_replay and board in (None, UNSEEN) else marked if board else "ACCEPTED"
             print(f"{name[:56]:56}  {told:11}  {'refused' if judged else 'ACCEPTED'}", flush=True)
             if arguments.sentences:
                 print(f"    board: {board}\n    judge: {judged}")
-    print(f"{count} kinds, {count - len(accepted)} refused" + "".join(f"\naccepted: {name}" for name in accepted))
+    print(
+        f"{count} kinds, {len(accepted)} accepted, {len(unseen)} refused by the judge and marked by the board as unseen alone"
+    )
+    print("\n".join([f"accepted: {name}" for name in accepted] + [f"unseen: {name}" for name in unseen]))
     sys.exit(bool(accepted))
 
 

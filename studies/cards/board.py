@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -19,10 +19,14 @@ from ...gauge.result import Result
 from ...gauge.suite import load_suite, suite_names
 from ...gauge.suited import suited
 from ...gauge.totals import environment_weights
-from ...policy.contract import EXTEROCEPTIVE_TERMS, PRIVILEGED_TERMS
+from ...policy.base import PolicyError
+from ...policy.contract import EXTEROCEPTIVE_TERMS, PRIVILEGED_TERMS, ContractError
 from ...policy.finding import shipped_policies
-from ...policy.loading import load_policy
+from ...policy.loading import load_policy, own_contract
+from ...policy.native import FilePolicy
 from ...policy.robot_of import robot_for
+from ...robots import RobotError
+from ...robots.loading import robot_digest
 from ..compare.comparison import load_result
 from ..naming import distinct_names
 from ..policies import file_digest
@@ -47,6 +51,7 @@ def write_board(folder: Path, page: Path) -> Path:
     cards = {str(file.relative_to(folder)): load_result(file) for file in files}
     shipped = {name: load_suite(name) for name in suite_names()}
     by_digest = {suite.digest: suite for suite in shipped.values()}
+    seen = set()
     for file, card in cards.items():
         named, source = card.suite, f"the card '{one_line(file)}'"
         if named.digest not in by_digest and (suite := shipped.get(named.name)):
@@ -55,29 +60,27 @@ def write_board(folder: Path, page: Path) -> Path:
                 f"{suite.version} with {suite.digest[:12]}…; evaluate its policy again, or take the card away"
             )
         check_card(card, by_digest.get(named.digest), source)
-        if named.digest in by_digest and _ships(card):
-            policy = load_policy(card.policy.path)
-            with suppress(BackendError):  # an engine that is not here is asked by whoever replays the card
-                check_policy(
-                    card,
-                    suited(by_digest[named.digest], policy.contract),
-                    policy,
-                    robot_for(policy.contract, None),
-                    source,
-                )
+        if named.digest in by_digest and (policy := _own_policy(card, (folder / file).parent)):
+            # without the card's engine or robot nothing can be said; whoever replays the card is told
+            with suppress(BackendError, RobotError, ContractError):
+                robot = robot_for(policy.contract, None)
+                if policy.path in shipped_policies() or card.robot_digest in (None, robot_digest(robot)):
+                    check_policy(card, suited(by_digest[named.digest], policy.contract), policy, robot, source)
+                    seen.add(file)
     with edited(f"a card in '{one_line(folder)}'", CardError, jinja2.TemplateError):
-        text = render_board(board_data(cards, folder))
+        text = render_board(board_data(cards, folder, seen))
     make_folder(page.parent, CardError)
     write_atomically(page, text, CardError)
     return page
 
 
-def board_data(cards: Mapping[str, Result], folder: Path = Path()) -> list[dict[str, Any]]:
+def board_data(cards: Mapping[str, Result], folder: Path = Path(), seen: Collection[str] = ()) -> list[dict[str, Any]]:
     """Return the tables of a board, one for each suite and robot, both by digest, and engine, those with most cards first. Policies
     that see the ground have tables of their own.
 
     Args:
         folder: the folder in which the command that checks a card finds the files.
+        seen: cards with a policy that is here and holds all that they say of it.
 
     Returns:
         For each table ``suite``, ``backend``, ``robot``, ``robot_digest`` (None where cards do not say), ``exteroceptive`` (its
@@ -95,7 +98,10 @@ def board_data(cards: Mapping[str, Result], folder: Path = Path()) -> list[dict[
     for key, rows in sorted(tables.items(), key=lambda item: -len(item[1])):
         # a card's own name and folder are part of the path: they stand for a policy whose file is called as any other
         names = distinct_names([f"{folder.absolute() / name}/{card.policy.path}" for name, card in rows.items()])
-        entries = [_entry(name, card, folder, policy) for (name, card), policy in zip(rows.items(), names, strict=True)]
+        entries = [
+            _entry(name, card, folder, policy, name in seen)
+            for (name, card), policy in zip(rows.items(), names, strict=True)
+        ]
         entries.sort(key=lambda e: -1.0 if e["score"] is None else e["score"], reverse=True)
         ranked = [e for e in entries if e["ranked"]]
         for entry in ranked:  # equal scores share a rank
@@ -127,10 +133,21 @@ def _sees_ground(card: Result) -> bool:
     return stated or bool(set(card.policy.observations or ()) & set(EXTEROCEPTIVE_TERMS))
 
 
-def _ships(card: Result) -> bool:
-    """Return whether a card is of a policy that ships."""
-    path = card.policy.path
-    return path in shipped_policies() and file_digest(path) == card.policy.file_sha256
+def _file_of(card: Result, folder: Path) -> str | None:
+    """Return the file, or the name, of a card's policy: one that ships, one at the card's path or from its folder; None for none."""
+    for path in (card.policy.path, str(folder / card.policy.path)):
+        with suppress(PolicyError, OSError):
+            if file_digest(path) == card.policy.file_sha256:
+                return path
+    return None
+
+
+def _own_policy(card: Result, folder: Path) -> FilePolicy | None:
+    """Return a card's policy where it is here with its contract inside; others may have been played with a contract of their own."""
+    with suppress(PolicyError):
+        file = _file_of(card, folder)
+        return None if file is None or own_contract(file, "another") else load_policy(file)
+    return None
 
 
 def _interval(card: Result, together: int) -> tuple[float, float] | None:
@@ -148,10 +165,9 @@ def _possible_ranks(entry: Mapping[str, Any], ranked: Sequence[Mapping[str, Any]
     return 1 + sum(other[0] > high for other in known), len(ranked) - sum(other[1] < low for other in known)
 
 
-def _entry(name: str, card: Result, folder: Path, policy: str) -> dict[str, Any]:
+def _entry(name: str, card: Result, folder: Path, policy: str, seen: bool) -> dict[str, Any]:
     """Return a line of the board."""
-    terms, path = card.policy.observations, card.policy.path
-    found = _ships(card) or ((folder / name).parent / path).is_file()
+    terms, found = card.policy.observations, _file_of(card, (folder / name).parent)
     privileged = bool(set(terms or ()) & set(PRIVILEGED_TERMS))
     kind = "privileged" if privileged else "exteroceptive" if _sees_ground(card) else "measurable"
     return {
@@ -166,6 +182,7 @@ def _entry(name: str, card: Result, folder: Path, policy: str) -> dict[str, Any]
         "terms": list(terms or ()),
         "coverage": card.coverage.words,
         "proved": card.proved,
+        "seen": seen,
         "ranked": card.complete and card.score is not None and not privileged,
         "rank": None,
         "ranks": None,

@@ -1,11 +1,14 @@
 """The leaderboard: what is ranked, what is only listed, and that hostile text stays text."""
 
+import gzip
 import json
+from pathlib import Path
 
 import pytest
 from gaitgauge.cli.main import app
 from gaitgauge.gauge.coverage import UNPROVED, notes
 from gaitgauge.gauge.suite import load_suite
+from gaitgauge.policy.finding import find_policy
 from gaitgauge.studies.cards.board import board_data, render_board, write_board
 from gaitgauge.studies.cards.verify import CardError
 from gaitgauge.studies.compare.comparison import ComparisonError
@@ -210,3 +213,22 @@ def test_a_policy_that_ships_is_found_by_name_where_it_is_the_card_s():
         "gaitgauge verify a",
         "gaitgauge verify b --policy FILE",  # of another release
     ]
+
+
+def test_what_a_card_says_of_a_policy_beside_it_is_checked_and_what_lies_nowhere_is_marked(tmp_path):
+    shipped = Path(__file__).parents[2] / "docs/data/scorecards/pretrained-robogauge-1.1.json.gz"
+    content = json.loads(gzip.decompress(shipped.read_bytes()))
+    content["policy"]["path"] = "mine.gauge.pt"
+
+    def marked(change):
+        (tmp_path / "card.json").write_text(json.dumps(content | change))
+        return Page(write_board(tmp_path, tmp_path / "board.html").read_text()).text.count("policy unseen")
+
+    weak = {"motors": content["motors"] | {"stiffness": [1.0] * 12}}
+    assert marked({}) == marked(weak) == 1
+    (tmp_path / "mine.gauge.pt").write_bytes(find_policy("pretrained").read_bytes())
+    assert marked({}) == 0
+    with pytest.raises(CardError, match=r"card\.json': motors\.stiffness is"):
+        marked(weak)
+    (tmp_path / "mine.gauge.pt").write_bytes(b"another file")
+    assert marked(weak) == 1

@@ -1,11 +1,14 @@
 """Forged score cards are refused: the worst ones at once, all kinds in the slow suite."""
 
 import copy
+import gzip
+import json
 import sys
 from pathlib import Path
 
 import pytest
 from gaitgauge.gauge.result import Result
+from gaitgauge.policy.finding import find_policy
 from sample_results import sample
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
@@ -32,7 +35,7 @@ def card(request):
 
 
 def test_the_honest_card_is_accepted(card, tmp_path):
-    assert forgeries.try_board(card, tmp_path) is None
+    assert forgeries.try_board(card, tmp_path) == forgeries.UNSEEN  # its policy does not ship
     honest = Result.from_data(card, "it", ValueError)
     assert forgeries.try_judge(card, honest, tmp_path) is None
 
@@ -44,7 +47,7 @@ def test_the_worst_forgeries_are_refused_in_one_sentence(card, tmp_path, kind):
     forged = forger(forged) or forged
     honest = Result.from_data(card, "it", ValueError)
     for said in (forgeries.try_board(forged, tmp_path), forgeries.try_judge(forged, honest, tmp_path)):
-        assert said and said.isprintable() and "\n" not in said
+        assert said and said != forgeries.UNSEEN and said.isprintable() and "\n" not in said
 
 
 def test_kinds_that_change_nothing_are_left_out(card, tmp_path):
@@ -62,8 +65,9 @@ def test_all_kinds_of_forgeries_are_refused(card, tmp_path):
     found = list(forgeries.tried(card, tmp_path))
     assert len(found) > 120
     assert [name for name, _, judged in found if judged is None] == []
-    # the card is of a policy that does not ship, so that the board cannot know its file, motors or training
-    told = {name for name, board, _ in found if board is None and not name.startswith(forgeries.REPLAY)}
+    # the card is of a policy that does not ship, so that the board cannot know its file, motors or training, and says so
+    assert [name for name, board, _ in found if board is None] == []
+    told = {name for name, board, _ in found if board == forgeries.UNSEEN and not name.startswith(forgeries.REPLAY)}
     of_the_policy = (
         "motors",
         "polic",
@@ -76,3 +80,15 @@ def test_all_kinds_of_forgeries_are_refused(card, tmp_path):
         "robot",
     )
     assert [name for name in told if not any(word in name for word in of_the_policy)] == []
+
+
+@pytest.mark.slow
+def test_all_kinds_are_refused_by_the_board_where_the_policy_is_here(tmp_path):
+    shipped = Path(__file__).parents[2] / "docs/data/scorecards/pretrained-robogauge-1.1.json.gz"
+    content = json.loads(gzip.decompress(shipped.read_bytes()))
+    content["policy"]["path"] = "mine.gauge.pt"
+    (tmp_path / "mine.gauge.pt").write_bytes(find_policy("pretrained").read_bytes())
+    assert forgeries.try_board(content, tmp_path) is None
+    found = list(forgeries.tried(content, tmp_path))
+    assert [name for name, board, _ in found if not board and not name.startswith(forgeries.REPLAY)] == []
+    assert [name for name, _, judged in found if judged is None] == []
