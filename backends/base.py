@@ -302,6 +302,8 @@ class PhysicsBackend(ABC):
     scene: Scene
     device: torch.device
     dtype: torch.dtype
+    _state: PhysicsState
+    _sample: PhysicsState
     parallel_processes: ClassVar[bool] = False
     """True for an engine on the CPU that plays faster as one process a core than as one process with threads. Several processes may
     then build worlds at the same time, here and on a cluster; results may not depend on their number."""
@@ -351,14 +353,14 @@ class PhysicsBackend(ABC):
         return self.scene.num_worlds
 
     @property
-    @abstractmethod
     def state(self) -> PhysicsState:
-        """Return the state after the last call."""
+        """Return the state after the last call: what an engine keeps in ``_state``. Its tensors may change with the next call."""
+        return self._state
 
     @property
-    @abstractmethod
     def sample(self) -> PhysicsState:
-        """Return the state snapshot of ``step(sample_at=…)``; rows of worlds without a request are stale."""
+        """Return the state snapshot of ``step(sample_at=…)``, kept in ``_sample``; rows of worlds without a request are stale."""
+        return self._sample
 
     @abstractmethod
     def reset(self, start: ResetState, worlds: torch.Tensor | None = None) -> None:

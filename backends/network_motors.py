@@ -10,13 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 
 from ..robots.motor_network import MotorNetwork, load_motor_network
 from .arguments import check_randomization, check_start, check_step
-from .base import BackendError, Capability, PhysicsBackend, PhysicsState, Randomization, ResetState, Scene
+from .base import BackendError, Capability, PhysicsBackend, Randomization, ResetState, Scene
+from .wrapped import WrappedBackend
 
 _FIRST = ("tilt_substep", "penetration_substep")
 _WITHOUT_GAINS = ("stiffness_scale", "damping_scale")
@@ -102,7 +103,7 @@ class NetworkState:
         return value, torch.stack((torch.stack(outputs), torch.stack(cells)))
 
 
-class NetworkMotors(PhysicsBackend):
+class NetworkMotors(WrappedBackend):
     """An engine whose motors are a network. Made by ``make_backend`` where a parameter set says ``motor = "network"``."""
 
     name: ClassVar[str] = "network motors"
@@ -131,15 +132,13 @@ class NetworkMotors(PhysicsBackend):
         network = load_motor_network(scene.parameters.network)
         physics = scene.physics
         self._piece = steps_between_calls(network, physics.timestep, physics.control_period)
-        self.scene = scene
         inside = replace(scene, parameters=replace(scene.parameters, motor="torque", network=None))
         if not engine.torque_motors:
             raise BackendError(
                 f"engine '{engine.name}' has no motors that take a torque, which motors by network need; choose another --backend"
             )
-        self.inner = engine(inside, device=device, threads=threads)
+        super().__init__(engine(inside, device=device, threads=threads), scene)
         self.name, self.capabilities = self.inner.name, engine.capabilities  # type: ignore[misc, method-assign]
-        self.device, self.dtype = self.inner.device, self.inner.dtype
         n, joints = scene.num_worlds, scene.robot.num_joints
         self._network = NetworkState(network, n, joints, self.device)
 
@@ -148,23 +147,7 @@ class NetworkMotors(PhysicsBackend):
 
         self._held, self._offset = zeros(n, joints), zeros(n, joints)
         self._limp = torch.ones(n, dtype=torch.bool, device=self.device)
-        self._limp_before = self._limp.clone()
         self._everyone = torch.ones(n, dtype=torch.bool, device=self.device)
-
-    @property
-    def engine_seconds(self) -> float | None:  # type: ignore[override]
-        """Return the engine's own time so far [s]."""
-        return self.inner.engine_seconds
-
-    @property
-    def state(self) -> PhysicsState:
-        """See ``PhysicsBackend.state``."""
-        return self.inner.state
-
-    @property
-    def sample(self) -> PhysicsState:
-        """See ``PhysicsBackend.sample``."""
-        return self.inner.sample
 
     def reset(self, start: ResetState, worlds: torch.Tensor | None = None) -> None:
         """See ``PhysicsBackend.reset``; the network forgets."""
@@ -231,19 +214,7 @@ class NetworkMotors(PhysicsBackend):
             self._offset[rows] = offset if len(offset) == len(rows) else offset[rows]
         self.inner.randomize(replace(randomization, motor_offset=None), worlds)
 
-    def push(self, worlds: torch.Tensor | None = None, **velocities: Any) -> None:
-        """See ``PhysicsBackend.push``."""
-        self.inner.push(worlds, **velocities)
-
-    def apply_force(self, force_w: torch.Tensor) -> None:
-        """See ``PhysicsBackend.apply_force``."""
-        self.inner.apply_force(force_w)
-
     def describe(self) -> Mapping[str, list[float]] | None:
         """See ``PhysicsBackend.describe``; stiffness and damping are left out."""
         found = self.inner.describe()
         return None if found is None else {k: v for k, v in found.items() if k not in ("stiffness", "damping")}
-
-    def close(self) -> None:
-        """Free the engine's resources."""
-        self.inner.close()

@@ -220,48 +220,34 @@ def follow_reference(
         changes: arguments of ``Reference.change`` for every world.
         force_w: force on the base of every world [N], (N, 3).
     """
+
+    def follow(finer: int) -> str:
+        physics = worlds.backend.scene.physics
+        quaternions, positions, joints = [], [], []
+        for row, change in enumerate(changes or [{}] * worlds.count):
+            reference = Reference(bench.robot, worlds.backend.scene.parameters, timestep=physics.timestep / finer)
+            reference.change(**change)
+            if force_w is not None:
+                reference.force_w = force_w[row]
+            reference.place(**{name: value[row] for name, value in asked.items()})
+            steps = round(seconds / physics.timestep)
+            reference.step(None if target is None else target[row], substeps=steps, finer=finer)
+            quaternions.append(reference.base_quaternion)
+            positions.append(reference.base_position)
+            joints.append(reference.joint_position)
+        turned = angle_between(state.base_quaternion_w, quaternions)
+        turn = expect_close("base orientation against the reference [rad]", turned, 0.0, angle)
+        joint = expect_close("joint_position against the reference [rad]", state.joint_position, joints, angle)
+        place = expect_close("base_position_w against the reference [m]", state.base_position_w, positions, position)
+        return f"joints {joint:.1e} rad, base {turn:.1e} rad and {place:.1e} m from the reference"
+
     try:
-        return _follow(bench, worlds, asked, state, seconds, angle, position, target, changes, force_w, finer=1)
+        return follow(1)
     except ConformanceError as coarse:
         try:
-            said = _follow(bench, worlds, asked, state, seconds, angle, position, target, changes, force_w, finer=FINER)
+            return f"{follow(FINER)} in finer steps"
         except ConformanceError:
             raise coarse from None
-        return f"{said} in finer steps"
-
-
-def _follow(
-    bench: Bench,
-    worlds: Worlds,
-    asked: dict[str, Any],
-    state: Any,
-    seconds: float,
-    angle: float,
-    position: float,
-    target: np.ndarray | None,
-    changes: list[dict[str, Any]] | None,
-    force_w: np.ndarray | None,
-    *,
-    finer: int,
-) -> str:
-    physics = worlds.backend.scene.physics
-    quaternions, positions, joints = [], [], []
-    for row, change in enumerate(changes or [{}] * worlds.count):
-        reference = Reference(bench.robot, worlds.backend.scene.parameters, timestep=physics.timestep / finer)
-        reference.change(**change)
-        if force_w is not None:
-            reference.force_w = force_w[row]
-        reference.place(**{name: value[row] for name, value in asked.items()})
-        steps = round(seconds / physics.timestep)
-        reference.step(None if target is None else target[row], substeps=steps, finer=finer)
-        quaternions.append(reference.base_quaternion)
-        positions.append(reference.base_position)
-        joints.append(reference.joint_position)
-    turned = angle_between(state.base_quaternion_w, quaternions)
-    turn = expect_close("base orientation against the reference [rad]", turned, 0.0, angle)
-    joint = expect_close("joint_position against the reference [rad]", state.joint_position, joints, angle)
-    place = expect_close("base_position_w against the reference [m]", state.base_position_w, positions, position)
-    return f"joints {joint:.1e} rad, base {turn:.1e} rad and {place:.1e} m from the reference"
 
 
 def base_up(quaternion: np.ndarray) -> np.ndarray:

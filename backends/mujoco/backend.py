@@ -27,7 +27,6 @@ from ..base import (
     BackendError,
     Capability,
     PhysicsBackend,
-    PhysicsState,
     Randomization,
     ResetState,
     Scene,
@@ -54,6 +53,8 @@ class MujocoBackend(PhysicsBackend):
     name: ClassVar[str] = "mujoco"
     family: ClassVar[str] = "MuJoCo"
     parallel_processes: ClassVar[bool] = True
+    _state: BatchState
+    _sample: BatchState
 
     @classmethod
     def capabilities(cls) -> Mapping[str, Capability]:
@@ -123,16 +124,6 @@ class MujocoBackend(PhysicsBackend):
         self._joint_v = np.array([model.joint(j).dofadr[0] for j in robot.joint_names])
         self._bodies = np.array([model.body(b).id for b in robot.collision_bodies])
         self._feet = np.array([model.geom(name).id for name in robot.foot_geoms])
-
-    @property
-    def state(self) -> PhysicsState:
-        """Return the state after the last call, as views of MuJoCo's memory that change with the next call."""
-        return self._state
-
-    @property
-    def sample(self) -> PhysicsState:
-        """Return the snapshot of the last ``step(sample_at=…)``."""
-        return self._sample
 
     def _rows(self, worlds: torch.Tensor | None) -> NDArray[np.int64]:
         """Return the indices of the masked worlds."""

@@ -134,16 +134,6 @@ class SequentialBackend(PhysicsBackend):
             arrays[item.name] = np.zeros((n, *row), dtype=_KINDS.get(item.name, real))
         return PhysicsState(**{name: torch.from_numpy(array) for name, array in arrays.items()}), arrays
 
-    @property
-    def state(self) -> PhysicsState:
-        """Return the state after the last call."""
-        return self._state
-
-    @property
-    def sample(self) -> PhysicsState:
-        """Return the snapshot of the last ``step(sample_at=…)``."""
-        return self._sample
-
     def _rows(self, worlds: torch.Tensor | None) -> list[int]:
         """Return the indices of the masked worlds."""
         return list(range(self.num_worlds)) if worlds is None else np.flatnonzero(worlds.numpy()).tolist()

@@ -16,7 +16,7 @@ import torch
 import warp as wp
 
 from ..arguments import check_push, check_randomization, check_start, check_step
-from ..base import BackendError, PhysicsBackend, PhysicsState, Randomization, ResetState, Scene
+from ..base import BackendError, PhysicsBackend, Randomization, ResetState, Scene
 from ..devices import find_device
 from .device import DeviceScope
 from .motors import MotorTensors, read_torques
@@ -93,16 +93,6 @@ class WarpBackend(PhysicsBackend):
         """Launch the kernels that give the active worlds' bases the velocities in ``_twist``."""
 
     # ---- the contract -----------------------------------------------------------------------------------------------
-
-    @property
-    def state(self) -> PhysicsState:
-        """Return the state after the last call; the tensors change with the next call."""
-        return self._state
-
-    @property
-    def sample(self) -> PhysicsState:
-        """Return the snapshot of the last ``step(sample_at=…)``."""
-        return self._sample
 
     def reset(self, start: ResetState, worlds: torch.Tensor | None = None) -> None:
         """See ``PhysicsBackend.reset``. On a GPU the kernel clamps terrains, because a check would wait for the device."""

@@ -12,7 +12,7 @@ from typing import Any
 import jinja2
 from markupsafe import Markup
 
-from ...files.parsing import edited, read_results
+from ...files.parsing import edited, read_results, shown
 from ...files.writing import write_atomically
 from ..store import StoreError
 
@@ -49,12 +49,15 @@ def _visible(value: object) -> object:
     return type(value)(_CONTROL.sub(lambda found: found[0].encode("unicode_escape").decode(), value))
 
 
-def page_of(source: Path, name: str, render: Callable[[dict[str, Any]], str], *, command: str) -> Path:
+def page_of(
+    source: Path, name: str, render: Callable[[dict[str, Any]], str], *, command: str, schema: int | None = None
+) -> Path:
     """Write the page of a finished run beside the file that it shows, all or nothing.
 
     Args:
         source: what the run found, JSON.
         command: of ``gaitgauge`` that writes ``source``, for who lacks it.
+        schema: of results that ``render`` takes, None where it looks itself.
 
     Raises:
         StoreError: the folder holds no such file, or a damaged one, or one of another version.
@@ -64,6 +67,8 @@ def page_of(source: Path, name: str, render: Callable[[dict[str, Any]], str], *,
         raise StoreError(f"{folder} holds no {source.name}; run gaitgauge {command} with --out {folder} first")
     try:
         results = read_results(source, "results", StoreError)
+        if schema is not None and (stated := results.get("schema")) != schema:
+            raise StoreError(f"{source} has schema {shown(stated)}, this version reads {schema}")
         with edited(str(source), StoreError, jinja2.TemplateError):
             text = render(results)
     except StoreError as error:

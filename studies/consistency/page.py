@@ -6,11 +6,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePath
 from typing import Any
 
-from ...files.parsing import shown
 from ...gauge.metrics import metric_label
 from ...gauge.report.charts import number, terrain_label
 from ...gauge.report.pages import page_of, page_template
-from ...gauge.store import StoreError
 from .. import interval_charts
 from .charts import curves
 from .statistics import DIFFERENT, EQUIVALENT
@@ -50,19 +48,11 @@ def write_page(folder: Path) -> Path:
     Raises:
         StoreError: the folder holds no study, or a damaged one, or one of another version.
     """
-    return page_of(folder / "consistency.json", "consistency.html", render, command="consistency")
+    return page_of(folder / "consistency.json", "consistency.html", render, command="consistency", schema=SCHEMA)
 
 
 def render(results: Mapping[str, Any]) -> str:
-    """The page of some results, as HTML text. Whatever they contain is shown as text and never becomes markup.
-
-    Raises:
-        StoreError: results of another schema.
-    """
-    if results.get("schema") != SCHEMA:
-        raise StoreError(
-            f"the study has schema {shown(results.get('schema'))}, this version reads {SCHEMA}; run it again"
-        )
+    """The page of some results, as HTML text. Whatever they contain is shown as text and never becomes markup."""
     template = page_template(
         __file__,
         "consistency.html.j2",

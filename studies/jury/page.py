@@ -6,9 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ...files.parsing import shown
 from ...gauge.report.pages import page_of, page_template
-from ...gauge.store import StoreError
 from .. import interval_charts
 from .study import SCHEMA
 from .verdict import OFF, command_words
@@ -20,19 +18,11 @@ def write_page(folder: Path) -> Path:
     Raises:
         StoreError: the folder holds no jury, or a damaged one, or one of another version.
     """
-    return page_of(folder / "jury.json", "jury.html", render, command="jury")
+    return page_of(folder / "jury.json", "jury.html", render, command="jury", schema=SCHEMA)
 
 
 def render(results: Mapping[str, Any]) -> str:
-    """Return the page of some results, as HTML text. Whatever they contain is shown as text and never becomes markup.
-
-    Raises:
-        StoreError: results of another schema.
-    """
-    if results.get("schema") != SCHEMA:
-        raise StoreError(
-            f"the jury has schema {shown(results.get('schema'))}, this version reads {SCHEMA}; run it again"
-        )
+    """Return the page of some results, as HTML text. Whatever they contain is shown as text and never becomes markup."""
     suite = results["suite"]
     facts = [
         f"{suite['name']} {suite['version']}",

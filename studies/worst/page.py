@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from ...files.parsing import shown
 from ...gauge.report.pages import page_of, page_template
-from ...gauge.store import StoreError
 from .ranges import PARAMETERS
 from .study import SCHEMA
 
@@ -41,7 +40,7 @@ def write_page(folder: Path) -> Path:
     Raises:
         StoreError: the folder holds no search that has ended, or a damaged one, or one of another version.
     """
-    return page_of(folder / "worst.json", "worst.html", lambda results: render(results, folder), command="worst")
+    return page_of(folder / "worst.json", "worst.html", partial(render, folder=folder), command="worst", schema=SCHEMA)
 
 
 def render(results: Mapping[str, Any], folder: Path | None = None) -> str:
@@ -49,14 +48,7 @@ def render(results: Mapping[str, Any], folder: Path | None = None) -> str:
 
     Args:
         folder: of the films; None for a page without films.
-
-    Raises:
-        StoreError: results of another schema.
     """
-    if results.get("schema") != SCHEMA:
-        raise StoreError(
-            f"the search has schema {shown(results.get('schema'))}, this version reads {SCHEMA}; run it again"
-        )
     engines = [results["engine"], *(other["engine"] for other in results["others"])]
     failures = [
         dict(failure)

@@ -211,16 +211,6 @@ class FakeBackend(PhysicsBackend):
         self._place_feet(torch.ones_like(self.limp))
         self._sample = self._state.clone()
 
-    @property
-    def state(self) -> PhysicsState:
-        """State after the last call."""
-        return self._state
-
-    @property
-    def sample(self) -> PhysicsState:
-        """State after the substep asked for with ``sample_at``."""
-        return self._sample
-
     def reset(self, start: ResetState, worlds: torch.Tensor | None = None) -> None:
         """Put worlds into a state, as the contract says."""
         check_start(self.scene, start, worlds)

@@ -378,9 +378,10 @@ def test_page_is_self_contained_and_escapes_names(drifted, tmp_path):
     assert "nan" not in re.sub(r"<style>.*?</style>", "", html, flags=re.S).lower().replace("provenance", "")
     for words in ("Gap", "Models", "Not described by", "Open loop", "Attribution", "linear velocity tracking"):
         assert words in html
-    with pytest.raises(StoreError, match="schema"):
-        render({**results, "schema": 99})
     (tmp_path / "empty").mkdir()
+    (tmp_path / "consistency.json").write_text(json.dumps({**results, "schema": 99}))
+    with pytest.raises(StoreError, match=r"has schema 99, this version reads \d; run gaitgauge consistency again"):
+        write_page(tmp_path)
     with pytest.raises(StoreError, match="gaitgauge consistency"):
         write_page(tmp_path / "empty")
 
