@@ -22,10 +22,10 @@ from gaitgauge.files.choices import cpu_threads
 from gaitgauge.files.writing import write_atomically
 from gaitgauge.gauge.store import StoreError
 from gaitgauge.studies.worst.playing import Players
+from gaitgauge.studies.worst.prepared import PreparedSearch, prepare_search
 from gaitgauge.studies.worst.ranges import scenario_of
 from gaitgauge.studies.worst.request import WorstRequest
 from gaitgauge.studies.worst.search import random_case, upper_bound
-from gaitgauge.studies.worst.study import PreparedSearch, prepare_search
 
 _NORMAL, _POWER = 1.96, 0.84
 """Of a two-sided interval of 95 %, and of a difference that is seen with a chance of 80 %."""

@@ -18,7 +18,7 @@ from ..robots.anatomy.body_plan import body_plan
 from ..robots.rotation import rotate_inverse
 from ..studies.trials.running import run_each
 from ..studies.trials.scenario import Scenario, load_scenario
-from ..studies.worst.study import PreparedSearch
+from ..studies.worst.prepared import PreparedSearch
 from .drawing import Shot, draw, processes_for
 from .errors import UserError
 from .overlay import annotate

@@ -31,7 +31,8 @@ def run_worst(
     console = Terminal(stderr=True)
     quality = _quality(console) if films else None  # before MuJoCo is imported
     from ..studies.worst.page import write_page
-    from ..studies.worst.study import free_search_folder, prepare_search, search_worst
+    from ..studies.worst.prepared import free_search_folder, prepare_search
+    from ..studies.worst.study import search_worst
 
     prepared = prepare_search(request)  # all that can be wrong with the request is said before anything is written
     folder = out or free_search_folder(Path("results") / f"worst-{joined_names([request.policy])}", prepared)

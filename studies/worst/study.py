@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from itertools import chain, islice
 from pathlib import Path
 from typing import Any
@@ -13,23 +12,18 @@ from typing import Any
 import numpy as np
 import torch
 
-from ...backends.base import BackendError
 from ...backends.registry import engine_class
 from ...files.choices import cpu_threads
-from ...files.parsing import shown
 from ...files.provenance import provenance
 from ...files.writing import json_text, make_folder, write_atomically
-from ...gauge.suite import load_suite
-from ...robots import Robot
-from ...robots.loading import robot_digest
-from ..consistency.variants import Variant, parse_variant, parse_variants, place
-from ..naming import free_folder
-from ..policies import Loaded, describe, load_policies
+from ..consistency.variants import Variant
+from ..policies import describe
 from ..trials.scenario import Scenario, scenario_text
-from .folder import SearchLog, check_folder
+from .folder import SearchLog
 from .playing import Play, Players
-from .ranges import PARAMETERS, Case, Measures, Ranges, describe_case, measures_of, scenario_of
-from .request import OTHERS, WorstError, WorstRequest, WorstStatus
+from .prepared import PreparedSearch, identity, prepare_search
+from .ranges import PARAMETERS, Case, describe_case, scenario_of
+from .request import WorstError, WorstRequest, WorstStatus
 from .search import (
     CAUSE_APART,
     CONFIDENCE,
@@ -71,74 +65,6 @@ _REDUCED = 12
 Watch = Callable[[WorstStatus], None]
 
 
-@dataclass(kw_only=True)
-class PreparedSearch:
-    """A request that can be carried out."""
-
-    request: WorstRequest
-    label: str
-    loaded: Loaded
-    engine: Variant
-    others: list[Variant]
-    measures: Measures
-    ranges: Ranges = field(default_factory=Ranges)
-    skipped: list[dict[str, str]] = field(default_factory=list)
-    """Engines that do not play failures again, and why."""
-
-    @property
-    def robot(self) -> Robot:
-        """Return the robot."""
-        return self.loaded.robot
-
-
-def prepare_search(request: WorstRequest) -> PreparedSearch:
-    """Check a request and load what it names.
-
-    Raises:
-        WorstError: the policy cannot be had, or two engines are the same.
-        ConsistencyError, SuiteError, RobotError, ContractError, BackendError: one sentence on what is wrong.
-    """
-    suite = load_suite(request.suite)
-    device = request.device or ("cuda" if torch.cuda.is_available() else "cpu")
-    engine = _placed(parse_variant(request.backend), device)
-    engine.physics(suite.physics)
-    others: dict[str, Variant] = {}
-    skipped = []
-    for label, variant in parse_variants(OTHERS if request.others is None else request.others).items():
-        variant.physics(suite.physics)
-        if label == engine.label:
-            if request.others is not None:
-                raise WorstError(f"--others names {shown(label)}, the engine that is searched; name another one")
-            continue
-        try:
-            others[label] = _placed(variant, device)
-        except BackendError as error:
-            if request.others is not None:
-                raise
-            skipped.append({"engine": label, "reason": str(error)})
-    loaded, refused = load_policies(
-        [request.policy], request.robot, trust=request.trust, contract_file=request.contract
-    )
-    if refused:
-        raise WorstError(refused[0]["reason"])
-    ((label, found),) = loaded.items()
-    limits = found.policy.contract.command_limits
-    measures = measures_of(found.robot, limits, request.suite, request.seed, suite.parameters)
-    return PreparedSearch(
-        request=request,
-        label=label,
-        loaded=found,
-        engine=engine,
-        others=list(others.values()),
-        measures=measures,
-        skipped=skipped,
-    )
-
-
-def _placed(variant: Variant, device: str) -> Variant:
-    return place(variant, None if device == "cuda" else "cpu")
-
-
 def search_worst(
     request: WorstRequest | PreparedSearch,
     folder: Path,
@@ -162,7 +88,7 @@ def search_worst(
     prepared = request if isinstance(request, PreparedSearch) else prepare_search(request)
     torch.set_num_threads(1)  # several would change the last bits of the policy's output
     with ExitStack() as stack:
-        log = stack.enter_context(SearchLog(folder, _identity(prepared), resume=resume))
+        log = stack.enter_context(SearchLog(folder, identity(prepared), resume=resume))
         policy, robot = prepared.loaded.policy, prepared.robot
         players = stack.enter_context(Players(policy, robot, cpu_threads(prepared.request.threads)))
         search = _Search(prepared, log, players, (1.0 - reserve) * 60.0 * prepared.request.minutes, watch)
@@ -178,34 +104,6 @@ def search_worst(
             write_atomically(folder / name, scenario_text(search.scenario(case)), WorstError)
         write_atomically(folder / "worst.json", json_text(results), WorstError)
     return results
-
-
-def _identity(prepared: PreparedSearch) -> dict[str, Any]:
-    """Return all that decides about a search but for its length."""
-    return {
-        "policy": prepared.loaded.policy.file_sha256,
-        "contract": prepared.loaded.policy.contract.hash,
-        "robot": robot_digest(prepared.robot),
-        "suite": load_suite(prepared.request.suite).digest,
-        "engine": prepared.engine.label,
-        "device": prepared.engine.device,
-        "seed": prepared.request.seed,
-        "batch": prepared.request.batch,
-        "ranges": asdict(prepared.ranges),
-    }
-
-
-def free_search_folder(folder: Path, prepared: PreparedSearch) -> Path:
-    """Return a folder, or the first of ``<folder>-2`` …, in which no other search is."""
-
-    def is_free(candidate: Path) -> bool:
-        try:
-            check_folder(candidate, json.loads(json.dumps(_identity(prepared))), resume=True)
-        except WorstError:
-            return False
-        return True
-
-    return free_folder(folder, is_free)
 
 
 @dataclass(kw_only=True)

@@ -14,6 +14,7 @@ from gaitgauge.robots import load_robot
 from gaitgauge.studies.trials.scenario import load_scenario
 from gaitgauge.studies.worst import playing, study
 from gaitgauge.studies.worst.page import write_page
+from gaitgauge.studies.worst.prepared import prepare_search
 from gaitgauge.studies.worst.ranges import (
     FACTORS,
     NOMINAL,
@@ -270,7 +271,7 @@ def test_outcomes_are_those_of_the_engine(standing, monkeypatch, tmp_path):
         lambda name, scene, *, device, threads: FakeBackend(scene, script=script),
     )
     request = WorstRequest(policy=standing, backend="fake", others=(), suite=str(suite), threads=1, device="cpu")
-    prepared = study.prepare_search(request)
+    prepared = prepare_search(request)
     with playing.Players(prepared.loaded.policy, prepared.robot, 1) as players:
         pair = [(scenario_of(make_case(name, NOMINAL, ()), prepared.measures), 0) for name in ("a", "b")]
         upright, fallen = players.play(pair, prepared.engine)
@@ -281,7 +282,7 @@ def test_outcomes_are_those_of_the_engine(standing, monkeypatch, tmp_path):
 @pytest.mark.slow
 def test_outcomes_do_not_depend_on_processes():
     request = WorstRequest(policy="pretrained", others=(), threads=2, device="cpu")
-    prepared = study.prepare_search(request)
+    prepared = prepare_search(request)
     random = np.random.default_rng(5)
     plays = [(scenario_of(random_case(random, RANGES, str(i)), prepared.measures), 0) for i in range(5)]
     found = []
