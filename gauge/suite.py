@@ -372,12 +372,6 @@ def _tables(name: str, behind: tuple[Path, ...]) -> tuple[Path, dict[str, Any]]:
 _LONGEST_CHAIN = 10
 
 
-def _shares(suite: Suite) -> tuple[float, ...]:
-    """Return the numbers of a suite's commands that ``scale`` takes as shares."""
-    commands = suite.commands
-    return (*commands.flat, *commands.levelled, *commands.target_speed.values())
-
-
 def _goal_rules(suite: Suite) -> dict[str, bool]:
     """Return sentences on goals, each with True if the rule is kept."""
     paper, goals = get_args(GoalName), [g.name for g in suite.goals]
@@ -443,10 +437,11 @@ def _check(suite: Suite, source: str) -> None:
         "'counter', or let scoring.level be 'bisection'"
     ] = scoring.level != "area" or suite.noise.stream == "counter"
     rules["written is no rule of a suite file; leave it out"] = suite.written is None
-    largest = max(_shares(suite))
+    commands = suite.commands
+    largest = max(*commands.flat, *commands.levelled, *commands.target_speed.values())
     rules[
         f"commands.beyond is 'scale', which takes limits and target speeds as shares of a policy's limits; {largest:g} is above 1"
-    ] = suite.commands.beyond != "scale" or largest <= 1.0
+    ] = commands.beyond != "scale" or largest <= 1.0
     rules |= _goal_rules(suite)
     if (push := suite.push) is not None:
         rules[f"push.after ({push.after[0]:g} to {push.after[1]:g} s) must rise"] = push.after[0] <= push.after[1]
@@ -469,18 +464,16 @@ def _check(suite: Suite, source: str) -> None:
             f"matrix.terrains has the unknown terrain {shown(name)}{did_you_mean(name, grounds) or ';'} choose from "
             f"{', '.join(grounds)}"
         ] = name in grounds
-    for name, limits in (("flat", suite.commands.flat), ("levelled", suite.commands.levelled)):
+    for name, limits in (("flat", commands.flat), ("levelled", commands.levelled)):
         rules[
             f"commands.{name} is {shown(list(limits))}; tracking errors are measured by these limits, so each must be above 0"
         ] = all(limit > 0.0 for limit in limits)
     rules["metrics.weights are all zero; give at least one metric a weight above 0"] = any(metrics.weights.values())
+    for group, names in scoring.groups.items():
+        for name in names:
+            rules[
+                f"scoring.groups.{group} names {shown(name)}, which has no weight; choose from {', '.join(metrics.weights)}"
+            ] = name in metrics.weights
     for rule, kept in rules.items():
         if not kept:
             raise SuiteError(f"{source}: {rule}")
-    for group, names in suite.scoring.groups.items():
-        missing = [n for n in names if n not in metrics.weights]
-        if missing:
-            known = ", ".join(metrics.weights)
-            raise SuiteError(
-                f"{source}: scoring.groups.{group} names {shown(missing[0])}, which has no weight; choose from {known}"
-            )
