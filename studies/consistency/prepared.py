@@ -21,7 +21,7 @@ from ...terrains.registry import gauge_terrain_names
 from .attribution import FLOOR_DRAWS, Factor, choose_factors, rounded
 from .closed_loop import Cell, Design, make_cells
 from .request import ConsistencyError, StudyRequest
-from .variants import Variant, parse_variant, parse_variants, place
+from .variants import Variant, parse_variant, parse_variants, place_all
 
 LEVEL = 3
 """Level of terrains that have levels, where none is asked for."""
@@ -192,17 +192,12 @@ def _engines(request: StudyRequest, suite: Suite) -> tuple[Variant, list[Variant
         raise ConsistencyError("a comparison needs two engines; give for example --backends mujoco,mujoco-warp")
     if wanted not in variants:
         variants = {wanted: parse_variant(wanted), **variants}
-    placed: dict[str, Variant] = {}
-    skipped = []
-    for label, variant in variants.items():
-        variant.physics(suite.physics)  # an impossible option is the user's mistake and not the machine's
-        try:
-            placed[label] = place(variant, request.device)
-        except BackendError as error:
-            if label == wanted or str(error).startswith(("unknown backend", "unknown Newton solver")):
-                raise
-            skipped.append({"backend": label, "reason": str(error)})
-    return placed[wanted], [v for label, v in placed.items() if label != wanted], skipped
+    unknown = ("unknown backend", "unknown Newton solver")
+    placed, reasons = place_all(
+        variants, suite.physics, request.device, needed=lambda label, why: label == wanted or why.startswith(unknown)
+    )
+    skipped = [{"backend": label, "reason": reason} for label, reason in reasons.items()]
+    return placed.pop(wanted), list(placed.values()), skipped
 
 
 def default_engines() -> tuple[str, str]:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any, get_type_hints
 
-from ...backends.base import PhysicsBackend, PhysicsOptions, Scene, Support
+from ...backends.base import BackendError, PhysicsBackend, PhysicsOptions, Scene, Support
 from ...backends.registry import choose_device, find_backend, make_backend
 from ...files.parsing import from_text, one_line, shown
 from .request import ConsistencyError
@@ -127,6 +127,28 @@ def place(variant: Variant, device: str | None) -> Variant:
     on_gpu = find_backend(variant.backend, "cpu").capabilities()["gpu"].support is not Support.NONE
     wanted = "cpu" if device == "cpu" or not on_gpu else choose_device(variant.backend, device)
     return replace(variant, device=wanted)
+
+
+def place_all(
+    variants: Mapping[str, Variant], suite: PhysicsOptions, device: str | None, *, needed: Callable[[str, str], bool]
+) -> tuple[dict[str, Variant], dict[str, str]]:
+    """Choose the devices of engines, by label; the second value says why others cannot run on this machine.
+
+    Raises:
+        BackendError: one cannot run that is ``needed``, which takes its label and the reason.
+        ConsistencyError: an impossible option.
+    """
+    placed: dict[str, Variant] = {}
+    reasons: dict[str, str] = {}
+    for label, variant in variants.items():
+        variant.physics(suite)
+        try:
+            placed[label] = place(variant, device)
+        except BackendError as error:
+            if needed(label, str(error)):
+                raise
+            reasons[label] = str(error)
+    return placed, reasons
 
 
 def _shown(value: Value) -> str:

@@ -29,7 +29,7 @@ from ...gauge.suite import Suite, load_suite
 from ...robots import Robot
 from ...robots.loading import robot_digest
 from ..consistency.closed_loop import Cell, play_variant
-from ..consistency.variants import Variant, parse_variants, place
+from ..consistency.variants import Variant, parse_variants, place_all
 from ..engine_pace import EnginePace, measure_all, measure_cost
 from ..naming import folder_name
 from ..policies import Loaded, describe, load_policies
@@ -128,24 +128,12 @@ def prepare_jury(request: JuryRequest) -> PreparedJury:
 
 def _engines(request: JuryRequest, suite: Suite) -> tuple[list[Variant], list[dict[str, str]]]:
     """Return the engines that judge, and those of the default that cannot run on this machine."""
-    found: dict[str, Variant] = {}
-    skipped = []
-    for label, variant in parse_variants(request.engines or ENGINES).items():
-        variant.physics(suite.physics)
-        try:
-            found[label] = place(variant, request.device or _device())
-        except BackendError as error:
-            if request.engines:
-                raise
-            skipped.append({"engine": label, "reason": str(error)})
+    device = request.device or (None if torch.cuda.is_available() else "cpu")  # a jury is small enough for the CPU
+    variants = parse_variants(request.engines or ENGINES)
+    found, reasons = place_all(variants, suite.physics, device, needed=lambda *_: bool(request.engines))
     if not found:
-        raise JuryError(f"no engine can judge here: {'; '.join(s['reason'] for s in skipped)}")
-    return list(found.values()), skipped
-
-
-def _device() -> str | None:
-    """Return the CPU where there is no GPU, since a jury is small enough for it."""
-    return None if torch.cuda.is_available() else "cpu"
+        raise JuryError(f"no engine can judge here: {'; '.join(reasons.values())}")
+    return list(found.values()), [{"engine": label, "reason": reason} for label, reason in reasons.items()]
 
 
 def jury(

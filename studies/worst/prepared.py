@@ -9,12 +9,11 @@ from typing import Any
 
 import torch
 
-from ...backends.base import BackendError
 from ...files.parsing import shown
 from ...gauge.suite import load_suite
 from ...robots import Robot
 from ...robots.loading import robot_digest
-from ..consistency.variants import Variant, parse_variant, parse_variants, place
+from ..consistency.variants import Variant, parse_variant, parse_variants, place, place_all
 from ..naming import free_folder
 from ..policies import Loaded, load_policies
 from .folder import check_folder
@@ -53,20 +52,10 @@ def prepare_search(request: WorstRequest) -> PreparedSearch:
     device = request.device or (None if torch.cuda.is_available() else "cpu")
     engine = place(parse_variant(request.backend), device)
     engine.physics(suite.physics)
-    others: dict[str, Variant] = {}
-    skipped = []
-    for label, variant in parse_variants(OTHERS if request.others is None else request.others).items():
-        variant.physics(suite.physics)
-        if label == engine.label:
-            if request.others is not None:
-                raise WorstError(f"--others names {shown(label)}, the engine that is searched; name another one")
-            continue
-        try:
-            others[label] = place(variant, device)
-        except BackendError as error:
-            if request.others is not None:
-                raise
-            skipped.append({"engine": label, "reason": str(error)})
+    asked = parse_variants(OTHERS if request.others is None else request.others)
+    if asked.pop(engine.label, None) and request.others is not None:
+        raise WorstError(f"--others names {shown(engine.label)}, the engine that is searched; name another one")
+    others, reasons = place_all(asked, suite.physics, device, needed=lambda *_: request.others is not None)
     loaded, refused = load_policies(
         [request.policy], request.robot, trust=request.trust, contract_file=request.contract
     )
@@ -82,7 +71,7 @@ def prepare_search(request: WorstRequest) -> PreparedSearch:
         engine=engine,
         others=list(others.values()),
         measures=measures,
-        skipped=skipped,
+        skipped=[{"engine": label, "reason": reason} for label, reason in reasons.items()],
     )
 
 

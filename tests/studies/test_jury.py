@@ -158,7 +158,7 @@ def test_engines_of_the_default_that_are_not_installed_are_left_out(brief, monke
             raise BackendError(f"backend '{variant.backend}' needs a package: pip install it")
         return variant
 
-    monkeypatch.setattr(judging, "place", placed)
+    monkeypatch.setattr(variants, "place", placed)
     prepared = judging.prepare_jury(replace(brief, engines=()))
     assert [v.label for v in prepared.engines] == ["mujoco", "mujoco@foot_condim=3"]
     assert [s["engine"] for s in prepared.skipped] == list(ENGINES[2:])
