@@ -41,6 +41,18 @@ PARTS: Mapping[str, Part] = {
         seeds=3,
     ),
 }  # fmt: skip
+BIPED_PARTS: Mapping[str, Part] = {
+    "short": Part(
+        suite="jury-biped", grounds=(("flat", 0), ("slope_fd", 6), ("stairs_fd", 3)), frictions=(0.6,), seeds=2
+    ),
+    "long": Part(
+        suite="jury-biped",
+        grounds=(("flat", 0), ("slope_fd", 6), ("stairs_fd", 3), ("wave", 5), ("obstacle", 3)),
+        frictions=(0.4, 0.6, 1.0),
+        seeds=3,
+    ),
+}
+"""The parts for two legs, on ground in their own measure: on the Go2's stairs a G1 begins with its soles inside a step."""
 _PART = "What is played: short takes minutes on two cores, long has all terrains and three frictions."
 _DEVICE = "cpu or cuda, for the engines that can use a GPU. Default: a GPU."
 

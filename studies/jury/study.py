@@ -33,7 +33,7 @@ from ..consistency.variants import Variant, parse_variants, place_all
 from ..engine_pace import EnginePace, measure_all, measure_cost
 from ..naming import folder_name
 from ..policies import Loaded, describe, load_policies
-from .request import ENGINES, PARTS, JuryCost, JuryError, JuryRequest, JuryStatus
+from .request import BIPED_PARTS, ENGINES, PARTS, JuryCost, JuryError, JuryRequest, JuryStatus
 from .verdict import Bench, sentences, verdict
 
 SCHEMA = 1
@@ -96,9 +96,6 @@ def prepare_jury(request: JuryRequest) -> PreparedJury:
     if request.part not in PARTS:
         hint = did_you_mean(request.part, PARTS) or ";"
         raise JuryError(f"there is no part {shown(request.part)}{hint} choose from {', '.join(PARTS)} (--part)")
-    part = PARTS[request.part]
-    suite = load_suite(part.suite)
-    engines, skipped = _engines(request, suite)
     policies, refused = load_policies(
         request.policies, request.robot, trust=request.trust, contract_file=request.contract
     )
@@ -112,6 +109,9 @@ def prepare_jury(request: JuryRequest) -> PreparedJury:
                 f"policy '{first}' is for robot '{robot.name}', '{label}' for '{policies[label].robot.name}'; one jury judges "
                 "policies of one robot"
             )
+    part = (BIPED_PARTS if len(robot.foot_names) == 2 else PARTS)[request.part]
+    suite = load_suite(part.suite)
+    engines, skipped = _engines(request, suite)
     for loaded in policies.values():
         check_fit(suite, robot, loaded.policy.contract)
     cells = [Cell(terrain=t, level=level, friction=f) for t, level in part.grounds for f in part.frictions]

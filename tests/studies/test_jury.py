@@ -9,19 +9,21 @@ import pytest
 import torch
 from gaitgauge.backends import BackendError
 from gaitgauge.gauge.episodes import Record
+from gaitgauge.gauge.ground_rules import build_terrain
 from gaitgauge.gauge.store import StoreError
 from gaitgauge.gauge.suite import load_suite
 from gaitgauge.policy.contract import standard_contract
 from gaitgauge.policy.native import StoredNetwork, save_policy
 from gaitgauge.policy.networks.architectures import MlpNetwork
 from gaitgauge.robots import load_robot
+from gaitgauge.robots.anatomy.body_plan import body_plan
 from gaitgauge.studies.consistency import variants
 from gaitgauge.studies.consistency.closed_loop import Cell
 from gaitgauge.studies.consistency.request import ConsistencyError
 from gaitgauge.studies.jury import request as asked
 from gaitgauge.studies.jury import study as judging
 from gaitgauge.studies.jury.page import write_page
-from gaitgauge.studies.jury.request import ENGINES, PARTS, JuryError, JuryRequest, Part
+from gaitgauge.studies.jury.request import BIPED_PARTS, ENGINES, PARTS, JuryError, JuryRequest, Part
 from gaitgauge.studies.jury.verdict import Bench, sentences, verdict
 from gaitgauge_fake_engine import FakeBackend, FakeScript
 
@@ -218,10 +220,40 @@ def test_equal_engines_have_no_advantage(bench):
 
 
 def test_parts_fit_the_suite():
-    for part in PARTS.values():
+    assert PARTS.keys() == BIPED_PARTS.keys()
+    for part in (*PARTS.values(), *BIPED_PARTS.values()):
         suite = load_suite(part.suite)
         assert all((level == 0) == (terrain == "flat") for terrain, level in part.grounds)
         assert all(0 <= level <= suite.scoring.levels for _, level in part.grounds)
+
+
+@pytest.mark.parametrize("part", BIPED_PARTS)
+def test_a_biped_begins_above_the_ground(part):
+    """On the Go2's stairs of level 6 the front of a G1's soles begins 3 cm inside a step, and some engines throw it."""
+    robot = load_robot("g1")
+    plan = body_plan(robot)
+    depths = []
+    for asked_for in (BIPED_PARTS[part], PARTS[part]):
+        ground = load_suite(asked_for.suite).ground
+        terrains = [build_terrain(ground, robot, name, level) for name, level in asked_for.grounds]
+        places = [(t, t.spawns.get("level_eval", next(iter(t.spawns.values())))) for t in terrains]
+        depths.append(
+            max(
+                float(t.height(place.position[0] + foot[0] + along, place.position[1] + foot[1]))
+                - (place.position[2] + robot.stand_height - plan.standing_height)
+                for t, place in places
+                if place.yaw == 0.0
+                for foot in plan.foot_position
+                for along in (-0.06, 0.0, 0.13)
+            )
+        )
+    assert depths[0] <= 0.0 and depths[1] > 0.03
+
+
+def test_two_legs_are_judged_on_ground_in_their_own_measure():
+    prepared = judging.prepare_jury(JuryRequest(policies=("pretrained-g1",), engines=("mujoco",)))
+    assert prepared.suite.name == "jury-biped" and prepared.world_steps <= 150_000
+    assert judging.prepare_jury(JuryRequest(policies=("pretrained",), engines=("mujoco",))).suite.name == "jury"
 
 
 def test_what_a_jury_takes_is_said_first_and_the_default_is_small(brief, tmp_path):
