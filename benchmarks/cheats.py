@@ -14,7 +14,7 @@ rounds leave the test as it is and cost half of a full screen; ``--by-thirds`` p
 those on the other two thirds, among all filters that the folder has whole, and how many of the ten best a first round would lose.
 
 A sub-command that a filter does not change is not played again: it gets the unfiltered policy's samples, to the last bit the same,
-since each begins with a reset and has noise of its own. So a filter that changes nothing gains exactly 0.
+since each begins with a reset and has noise of its own. Random filters that change no command at all are not counted.
 
 At every terrain and friction the lower bound of a listed cheat must be at most 0, or 0.002 where the unfiltered policy falls; that of a
 random filter must be at most 0. Else the exit code is 1. What the folder holds is not played again. 200 filters take about 2,100
@@ -24,6 +24,7 @@ episodes for the screen and 4,600 for the fresh seeds, 4 to 9 s of a core each w
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import math
 import multiprocessing
@@ -253,7 +254,7 @@ def _filter_commands(rollout: Rollout, change: Filter, period: float) -> None:
 
 def changes(change: Filter, commands: torch.Tensor, period: float) -> bool:
     """Return whether a filter may change one of a sub-command's commands, (T, 3)."""
-    if change.lag or change.stand or round(change.delay / period):
+    if change.lag or round(change.stand / period) or round(change.delay / period):
         return True
     cap = torch.tensor(change.cap)
     return not torch.equal(torch.clamp(commands * torch.tensor(change.scale), -cap, cap), commands)
@@ -513,7 +514,10 @@ def main() -> int:
     play_these(plays([NONE], screen) + plays([NONE], fresh if arguments.filters else few))
     play_these(plays(LISTED, few))
     kept = judge_listed(scores, terrains, few)
-    candidates = [random_filter(index) for index in range(arguments.filters)]
+    limits = torch.tensor([prepared.suite.command_limits(family) for family in ("flat", "slope")])
+    period = prepared.suite.physics.control_period
+    drawn = (random_filter(index) for index in itertools.count())
+    candidates = list(itertools.islice((c for c in drawn if changes(c, limits, period)), arguments.filters))
     if candidates:
         first = {t: (f,) for t, f in thirds(terrains, frictions, 0)}
         others = {t: tuple(f for f in frictions if f not in first[t]) for t in terrains}

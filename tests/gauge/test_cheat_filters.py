@@ -86,7 +86,8 @@ def test_a_filter_changes_the_sub_commands_that_it_touches():
     turn, walk = torch.tensor([[0.0, 0.0, 1.5]] * 3), torch.tensor([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])
     slow_turn = Filter(name="", cap=(1.0, 1.0, 1.0))
     assert cheats.changes(slow_turn, turn, 0.02) and not cheats.changes(slow_turn, walk, 0.02)
-    assert not cheats.changes(Filter(name="", delay=0.009), walk, 0.02)  # less than half a step
+    for change in (Filter(name="", delay=0.009), Filter(name="", walk=1.5, stand=0.009)):  # less than half a step
+        assert not cheats.changes(change, walk, 0.02)
     for change in (Filter(name="", delay=0.02), Filter(name="", lag=0.001), Filter(name="", walk=1.0, stand=0.1)):
         assert cheats.changes(change, walk, 0.02)
 
