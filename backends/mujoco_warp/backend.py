@@ -22,7 +22,7 @@ from ..warp.backend import WarpBackend
 from ..warp.device import is_memory_error, memory_advice
 from ..warp.state import StateArrays
 from ..warp.structures import filled, to_warp
-from . import kernels, readout
+from . import kernels, readout, side_by_side
 from .arrays import DROPPED, Links, Motion, Palette, Roles, contact_arrays, motion_arrays
 from .masses import BATCHED_FIELDS, WorldMasses, describe_model
 from .memory import bytes_per_world
@@ -147,7 +147,7 @@ class MujocoWarpBackend(WarpBackend):
         wp.launch(kernels.park_inactive, dim=n, inputs=[active, self._parked, motion])
         for substep in range(total):
             wp.launch(kernels.motor_law, dim=each_joint, inputs=[substep, motors, motion])
-            mujoco_warp.step(self._model, data)
+            side_by_side.step(self._model, data)
             end = [substep, self._upright_limit, active, self._parked, motion, live]
             wp.launch(kernels.end_substep, dim=n, inputs=end)
             if depth is not None:
