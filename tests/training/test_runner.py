@@ -141,6 +141,18 @@ def test_logged_reward_is_the_mean_of_finished_episodes():
     assert runner.logger.episode_length.tolist() == [8.0, 8.0, 8.0, 6.0, 4.0, 8.0, 8.0, 8.0]
 
 
+def test_the_log_keeps_the_last_hundred_episodes_of_each_group():
+    logger = make().logger
+    for number in range(64):
+        logger.add_step(8.0 * number + torch.arange(8.0), torch.ones(8, dtype=torch.bool), {})
+        if number % 8 == 7:
+            logger.collect()
+    ended = [float(i) for i in range(8 * 64)]  # one a step and world; every fourth world is the student's
+    assert list(logger.returns) == ended[-100:] and list(logger.lengths) == [1.0] * 100
+    assert list(logger.group_returns["student"]) == ended[::4][-100:]
+    assert list(logger.group_returns["teacher"]) == [e for e in ended if e % 4][-100:]
+
+
 @pytest.mark.usefixtures("hangups")
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_writes_a_checkpoint(tmp_path, number):

@@ -133,10 +133,13 @@ class RunLogger:
             (self._returns[self._finished], self._lengths[self._finished], rows[:, 1].float()), dim=1
         ).cpu()
         self._finished.zero_()
-        for value, length, index in finished.tolist():
-            self.returns.append(value)
-            self.lengths.append(length)
-            self.group_returns["student" if int(index) % self._student_period == 0 else "teacher"].append(value)
+        # Thousands may have ended, and the device waits meanwhile; a window keeps the last of them.
+        values, lengths, index = finished.numpy().T
+        student = index % self._student_period == 0
+        self.returns.extend(values[-WINDOW:].tolist())
+        self.lengths.extend(lengths[-WINDOW:].tolist())
+        for name, chosen in (("teacher", ~student), ("student", student)):
+            self.group_returns[name].extend(values[chosen][-WINDOW:].tolist())
         groups: dict[tuple[str, ...], list[torch.Tensor]] = {}
         for keys, values in self._entries:
             groups.setdefault(keys, []).append(values)
