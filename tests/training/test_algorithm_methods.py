@@ -76,26 +76,6 @@ def test_every_method_has_a_name_and_an_algorithm():
     assert all(issubclass(find_method(name), PPO) for name in METHODS) and len({*map(find_method, METHODS)}) == 5
 
 
-def test_the_policy_and_the_estimator_of_dreamwaq_may_learn_in_any_order():
-    ends = []
-    for swapped in (False, True):
-        algorithm, env = build("dreamwaq")
-        assert algorithm.apart
-        rollout(algorithm, env)
-        groups = algorithm.storage.minibatch_rows(2)
-        algorithm.storage.step = 0
-        algorithm.losses.prepare_policy()
-        parts = (lambda a=algorithm, g=groups: a.pass_over(g, a._policy_step), lambda a=algorithm, g=groups: a.teach(g))
-        for part in reversed(parts) if swapped else parts:
-            part()
-        ends.append(algorithm.save())
-    plain, other = ends
-    assert not find_method("cts").apart
-    for networks in ("actor_state_dict", "critic_state_dict"):
-        for name, value in plain[networks].items():
-            assert torch.equal(other[networks][name], value), name
-
-
 @pytest.mark.parametrize(
     ("method", "loss", "reached"),
     [

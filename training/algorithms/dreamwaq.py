@@ -95,7 +95,6 @@ class DreamwaqLosses(EstimatorLosses):
 class Dreamwaq(EstimatorPPO):
     """PPO with a variational context estimator. See the module docstring."""
 
-    apart = True
     actor_class, losses_class = DreamwaqActor, DreamwaqLosses
 
     @torch.no_grad()

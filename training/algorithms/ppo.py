@@ -35,8 +35,6 @@ class PPO:
 
     losses_class: ClassVar[type[Losses]]
     """Losses of the method."""
-    apart: ClassVar[bool] = False
-    """True if neither the policy nor the student's encoder learns from what the other's passes change: a GPU runs them side by side."""
     has_teacher: ClassVar[bool] = False
     """True if a teacher acts in some environments (``student_period``)."""
     estimated: ClassVar[int] = 0
@@ -74,9 +72,6 @@ class PPO:
         self.steps = 0
         """Minibatches of the last update, counted once in each pass over them."""
         self._graphs = on_gpu and configuration.cuda_graphs is not False
-        beside = self.apart and on_gpu and not self.processes.several
-        self._aside = torch.cuda.Stream(device) if beside else None
-        self._recorded = False
         self.losses: Any = self.losses_class(
             actor,
             critic,
@@ -288,24 +283,11 @@ class PPO:
         self._student.sums.zero_()
         groups = storage.minibatch_rows(settings.minibatches)
         self.losses.prepare_policy()
-        if self._aside is None or not self._recorded:
-            self.pass_over(groups, self._policy_step)
-            self.teach(groups)
-            self._recorded = True
-        else:
-            here = torch.cuda.current_stream(self._aside.device)
-            self._aside.wait_stream(here)
-            with torch.cuda.stream(self._aside):
-                self.teach(groups)
-            self.pass_over(groups, self._policy_step)
-            here.wait_stream(self._aside)
+        self.pass_over(groups, self._policy_step)
+        self.losses.prepare_student()
+        self.pass_over((storage.student_rows(groups[-1]),), self._student_step)
         wait()
         return self._report()
-
-    def teach(self, groups: Sequence[torch.Tensor]) -> None:
-        """Run the student's passes over the last group's rows."""
-        self.losses.prepare_student()
-        self.pass_over((self.storage.student_rows(groups[-1]),), self._student_step)
 
     def pass_over(self, groups: Sequence[torch.Tensor], step: Callable[..., None]) -> None:
         """Take a step on every minibatch of rows, (M, B) for each group, once in each pass."""
@@ -335,7 +317,6 @@ class PPO:
 
     def _prepare_steps(self) -> None:
         """Make the steps on one minibatch: gradients, their mean over the processes, and the step along them."""
-        self._recorded = False  # by the first update, which has the device for itself
         kl = self._policy.gradients.extra[self.losses.policy_names.index("kl")]
         self._policy_step = self.joined(self._policy_loss, self._policy, lambda: self._adapt_learning_rate(kl))
         self._student_step = self.joined(self._student_loss, self._student)
