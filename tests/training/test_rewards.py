@@ -12,7 +12,7 @@ from gaitgauge.training.environment.reward_configuration import (
     RewardShapes,
     RewardWeights,
 )
-from gaitgauge.training.environment.rewards import REWARD_TERMS, RewardFunction
+from gaitgauge.training.environment.rewards import PAID_BY_TILE, REWARD_TERMS, RewardFunction
 from gaitgauge.training.environment.step_inputs import FootInputs, StepInputs
 from gaitgauge.training.environment.terrain_configuration import FLAT_TILE
 
@@ -274,16 +274,18 @@ def test_the_error_of_turns_on_the_spot_counts_alike_below_and_above(quiet, comm
 
 
 def test_a_tile_pays_by_its_factors(quiet):
-    kinds = [FLAT_TILE, replace(FLAT_TILE, progress=0.0, yaw_tracking=1.5, linear_tracking=0.5)]
-    settings = RewardConfiguration(progress=2.0, yaw_tracking=1.0, linear_tracking=1.0)
-    rewards = RewardFunction(settings, 1.0, torch.tensor([0, 1]), kinds)
-    ahead = replace(quiet, command=one_world([1.0, 0.0, 0.0], 3), base_linear_velocity_b=one_world([1.0, 0.0, 0.0], 3))
+    factors = dict(zip(PAID_BY_TILE, (0.5, 1.5, 0.0, 4.0, 2.0), strict=True))
+    settings = replace(RewardConfiguration(), **dict.fromkeys(factors, 1.0))
+    rewards = RewardFunction(settings, 1.0, torch.tensor([0, 1]), [FLAT_TILE, replace(FLAT_TILE, **factors)])
+    ahead = replace(
+        quiet,
+        command=torch.tensor([[1.0, 0.0, 0.0]] * 2),
+        base_linear_velocity_b=torch.tensor([[1.0, 0.0, 2.0]] * 2),
+        base_angular_velocity_b=torch.tensor([[1.0, 2.0, 0.0]] * 2),
+    )
     paid = dict(zip(rewards.names, rewards(ahead, torch.tensor(0.0)).T.tolist(), strict=True))
-    assert [paid[name] for name in ("progress", "yaw_tracking", "linear_tracking")] == [
-        [2.0, 0.0],
-        [1.0, 1.5],
-        [1.0, 0.5],
-    ]
+    for (name, factor), plain in zip(factors.items(), (1.0, 1.0, 1.0, 4.0, 5.0), strict=True):
+        assert paid[name] == [plain, plain * factor]
 
 
 def test_every_weight_names_a_term():

@@ -211,7 +211,7 @@ REWARD_TERMS: Mapping[str, RewardTerm] = {
 """All terms by the names of their weights in ``RewardWeights``, which adds those of one's own."""
 
 
-PAID_BY_TILE = ("linear_tracking", "yaw_tracking", "progress")
+PAID_BY_TILE = ("linear_tracking", "yaw_tracking", "progress", "vertical_velocity", "roll_pitch_rate")
 """Terms with a factor for each kind of tile, under the same name in ``TileConfiguration``."""
 
 

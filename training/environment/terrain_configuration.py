@@ -40,6 +40,10 @@ class TileConfiguration:
     """Factor on the weight ``rewards.yaw_tracking``."""
     progress: NotNegative = 1.0
     """Factor on the weight ``rewards.progress``."""
+    vertical_velocity: NotNegative = 1.0
+    """Factor on the weight ``rewards.vertical_velocity``."""
+    roll_pitch_rate: NotNegative = 1.0
+    """Factor on the weight ``rewards.roll_pitch_rate``."""
     stationary_probability: NotNegative = 1.0
     """Factor on the share of stationary commands."""
     stationary_yaw_probability: NotNegative = 1.0
