@@ -4,7 +4,8 @@
 
 Eight robots side by side: standing, forward, backward at half of the limit (many policies have a smaller one there), left, right,
 turning both ways, and an arc at half of the limits. Motors have the gains of the policy's contract and the torque limits of
-``gaitgauge-1``. ``sways`` is the deviation of the yaw rate from its mean, RMS. ``--moving`` makes the joints that the policy does not drive
+``gaitgauge-1``. Deviations from the mean, RMS: ``bobs``, the vertical speed; ``rocks``, roll and pitch rate; ``sways``, the yaw rate
+[m/s, rad/s]. ``--moving`` makes the joints that the policy does not drive
 rigid but for those of the roles given; ``none`` makes all rigid. The exit code is 1 if one falls.
 """
 
@@ -69,15 +70,13 @@ def main() -> None:
         state = walk.state
         fell = torch.where((state.tilt_substep > 0) & fell.isinf(), step * period, fell)
         if step >= steps // 2:
-            linear = rotate_inverse(state.base_quaternion_w, state.base_linear_velocity_w)[:, :2]
-            seen.append(torch.cat((linear, state.base_angular_velocity_b[:, 2:]), dim=1))
+            linear = rotate_inverse(state.base_quaternion_w, state.base_linear_velocity_w)
+            seen.append(torch.cat((linear, state.base_angular_velocity_b), dim=1))
     spread, mean = (each.tolist() for each in torch.std_mean(torch.stack(seen), dim=0, correction=0))
-    for told, walks, sways, at in zip(command.tolist(), mean, spread, fell.tolist(), strict=True):
+    for told, walks, swings, at in zip(command.tolist(), mean, spread, fell.tolist(), strict=True):
         ending = "does not fall" if at == float("inf") else f"falls after {at:.1f} s"
-        line = "told {:5.2f} {:5.2f} {:5.2f}  walks {:5.2f} {:5.2f} {:5.2f}  sways {:4.2f}".format(
-            *told, *walks, sways[2]
-        )
-        print(line, "", ending)
+        told_walks = "told {:5.2f} {:5.2f} {:5.2f}  walks {:5.2f} {:5.2f} {:5.2f}".format(*told, *walks[:2], walks[5])
+        print(told_walks, " bobs {2:4.2f}  rocks {3:4.2f} {4:4.2f}  sways {5:4.2f}".format(*swings), "", ending)
     sys.exit(int(fell.isfinite().any()))
 
 
