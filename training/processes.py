@@ -1,14 +1,13 @@
 """Join the processes of one run, one for each GPU as ``starting`` or torchrun starts them, and choose each one's GPU.
 
-CPU tensors travel through gloo, which notices at once that a process is gone; GPU tensors through NCCL, which waits for it instead.
-A process that waits for the GPU therefore asks it again and again, so that signals arrive, and gives up in the end.
+CPU tensors travel through gloo, which notices at once that a process is gone; GPU tensors through NCCL, which waits for it instead:
+``run.rescue`` gives up in the end.
 """
 
 from __future__ import annotations
 
 import os
-import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -20,10 +19,8 @@ from ..backends.registry import choose_device
 from ..files.parsing import one_line, shown
 from .configuration import ConfigurationError
 
-PATIENCE = 300.0
-"""Longest wait for the others [s]; compiling may take one of them a minute longer."""
-PATIENCE_AFTER_SIGNAL = 10.0
-"""Longest wait [s] once this process was asked to stop: torchrun asks all others when one is lost."""
+RUN_TOLD = "GAITGAUGE_RUN_TOLD"
+"""Environment variable that names the file in which the first of several processes writes its run directory, for ``starting``."""
 
 
 def told_number(name: str, default: int) -> int:
@@ -122,20 +119,6 @@ class Processes:
             with _heard():
                 distributed.broadcast_object_list(shared, src=0, device=torch.device("cpu"))
         return shared[0]
-
-    def wait_for(self, device: torch.device | str, *, stopping: Callable[[], bool] = lambda: False) -> None:
-        """Wait until a GPU has done its work, which it cannot while another process is missing; ``stopping`` tells that this process was
-        asked to stop. Raises ProcessLostError: it took too long.
-        """
-        if not self.several or torch.device(device).type != "cuda":
-            return
-        done, begin = torch.cuda.Event(), time.monotonic()
-        done.record(torch.cuda.current_stream(device))
-        while not done.query():
-            limit = PATIENCE_AFTER_SIGNAL if stopping() else PATIENCE
-            if time.monotonic() - begin > limit:
-                raise ProcessLostError(f"another process did not answer for {limit:.0f} s")
-            time.sleep(2e-4)
 
 
 @contextmanager

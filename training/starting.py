@@ -16,7 +16,9 @@ from torch.distributed.elastic.multiprocessing import DefaultLogsSpecs, SignalEx
 from torch.distributed.elastic.multiprocessing.errors import ChildFailedError
 from torch.distributed.launcher.api import LaunchConfig, elastic_launch
 
+from ..policy.finding import latest_checkpoint
 from .configuration import ConfigurationError
+from .processes import RUN_TOLD
 
 
 def processes_to_start(gpus: int | None, asked: str | None, device: str) -> int:
@@ -51,6 +53,8 @@ def start_processes(count: int, arguments: Sequence[str]) -> int:
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     logging.getLogger("torch.distributed.elastic").setLevel(logging.CRITICAL)
     with tempfile.TemporaryDirectory() as folder:
+        told = Path(folder) / "run"
+        os.environ[RUN_TOLD] = str(told)
         logs = DefaultLogsSpecs(log_dir=folder, redirects=dict.fromkeys(range(1, count), Std.ALL))
         config = LaunchConfig(
             min_nodes=1,
@@ -72,11 +76,16 @@ def start_processes(count: int, arguments: Sequence[str]) -> int:
             sys.stderr.write("".join(dict.fromkeys(texts)))
             if killed:
                 name = signal.Signals(-failure.exitcode).name
-                sys.stderr.write(
-                    f"process {rank} of {count}, from 0, was killed ({name}); if no checkpoint is named above, no iteration was "
-                    "complete\n"
-                )
+                sys.stderr.write(f"process {rank} of {count}, from 0, was killed ({name}); {_left(told)}\n")
             return 128 - failure.exitcode if killed else failure.exitcode
         except SignalException as error:
             return 128 + error.sigval
     return 0
+
+
+def _left(told: Path) -> str:
+    """Return what there is to go on with after a process was killed, from the file that names the run directory."""
+    run = Path(told.read_text()) if told.is_file() else None
+    if run is None or (last := latest_checkpoint(run)) is None:
+        return "there is no checkpoint: start again"
+    return f"the last checkpoint is '{last}', go on with --resume {run}"

@@ -1,6 +1,9 @@
 """What is left when one of several processes is lost or diverges, as one process can show it."""
 
 import json
+import os
+import signal
+import threading
 
 import pytest
 import torch
@@ -56,7 +59,7 @@ def lose(tmp_path, monkeypatch, *, outcome, broken):
         with torch.no_grad():
             runner.alg.actor.student.actor[0].weight[0, 0] = float("nan")
         keep = runner.rescue.keepsake.keep
-        monkeypatch.setattr(runner, "_iterate", lambda obs, _: keep(runner.learned(), 2, "cpu") or obs)
+        monkeypatch.setattr(runner, "_iterate", lambda obs: keep({"learned": runner.learned()}, 2, "cpu") or obs)
     update_run_json(tmp_path, {"outcome": outcome})
     monkeypatch.setattr(LostProcesses, "lost", True)
     with pytest.raises((ProcessLostError, SystemExit)) as caught:
@@ -126,3 +129,51 @@ def test_a_process_that_fails_says_so_for_all(tmp_path, monkeypatch, complete):
     with pytest.raises(ZeroDivisionError):
         runner.learn(1)
     assert noted(tmp_path) == "failed"
+
+
+@pytest.mark.parametrize("complete", [0, 2])
+def test_a_process_that_hangs_in_a_message_ends_with_a_checkpoint_when_asked_to_stop(
+    tmp_path, monkeypatch, capfd, complete
+):
+    """As in NCCL: the call to a lost process never comes back, whatever signal arrives."""
+    runner = make(tmp_path)
+    update_run_json(tmp_path, {"outcome": "running"})
+    monkeypatch.setattr("gaitgauge.training.run.rescue.PATIENCE", 0.6)
+    monkeypatch.setattr("gaitgauge.training.run.rescue.PATIENCE_AFTER_SIGNAL", 0.3)
+    monkeypatch.setattr(LostProcesses, "lost", False)
+    ended, codes = threading.Event(), []
+
+    def end(code):
+        codes.append(code)
+        ended.set()
+
+    def hang(_):
+        if runner.iteration == complete:
+            os.kill(os.getpid(), signal.SIGTERM)
+            assert ended.wait(20.0), "nobody ended the process"
+            raise KeyboardInterrupt  # it would be gone by now
+
+    monkeypatch.setattr("gaitgauge.training.run.rescue.os._exit", end)
+    monkeypatch.setattr("gaitgauge.training.run.rescue.time.sleep", lambda _: None)
+    monkeypatch.setattr(runner.processes.__class__, "average", lambda _, values: hang(values))
+    before = {name: value.clone() for name, value in runner.alg.actor.state_dict().items()}
+    keep = runner.rescue.keep
+
+    def remember():
+        keep()
+        before.update({name: value.clone() for name, value in runner.alg.actor.state_dict().items()})
+
+    monkeypatch.setattr(runner.rescue, "keep", remember)
+    with pytest.raises(KeyboardInterrupt):
+        runner.learn(5)
+    assert codes == [2]
+    (sentence,) = [line for line in capfd.readouterr().err.splitlines() if line.startswith("gaitgauge: ")]
+    path = tmp_path / f"model_{complete}.pt"
+    if not complete:
+        assert sentence.endswith("did not answer for 0.6 s; no iteration was complete, so there is no new checkpoint")
+        assert not path.exists()
+        return
+    assert sentence.endswith(f"for 0.3 s; iteration 2 is in '{path}', go on with --resume {tmp_path}")
+    written = read_checkpoint(path)
+    assert written["iter"] == 2
+    assert all(torch.equal(value, before[name]) for name, value in written["actor_state_dict"].items())

@@ -129,14 +129,57 @@ def test_a_run_that_loses_a_process_ends_with_a_checkpoint_and_a_sentence(tmp_pa
     assert description["outcome"] == "lost a process" and description["iteration"] > 0
     (sentence,) = [line for line in output.splitlines() if line.startswith("gaitgauge: ")]
     assert "another process has gone: " in sentence
-    assert f"process {lost} of 2, from 0, was killed (SIGKILL)" in output
     here = last.relative_to(tmp_path)
+    assert f"process {lost} of 2, from 0, was killed (SIGKILL); the last checkpoint is '{here}'" in output
     assert f"iteration {description['iteration']} is in '{here}', go on with --resume {here.parent}" in sentence
     resumed = start(tmp_path, *TRAIN, "--resume", "latest", "--iterations", str(description["iteration"] + 1))
     output, _ = resumed.communicate(timeout=300)
     assert resumed.returncode == 0, output
     assert "what was left of several processes, not 2: episodes start anew, on the levels reached and at " in output
     assert (run / f"model_{description['iteration'] + 1}.rank1.pt").is_file()
+
+
+HANGING = """
+import ctypes, torch.distributed
+asked = torch.distributed.all_reduce
+
+def all_reduce(*arguments, **settings):
+    try:
+        return asked(*arguments, **settings)
+    except RuntimeError:
+        mutex = ctypes.create_string_buffer(64)
+        for _ in range(2):  # the second time for ever, in C, deaf to signals
+            ctypes.CDLL(None).pthread_mutex_lock(mutex)
+
+torch.distributed.all_reduce = all_reduce
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("lost", [0, 1])
+def test_a_process_that_hangs_because_another_one_was_killed_leaves_a_checkpoint(tmp_path, monkeypatch, lost):
+    """NCCL waits for a lost process, where gloo raises."""
+    (tmp_path / "sitecustomize.py").write_text(HANGING)
+    monkeypatch.setattr(sys, "path", [str(tmp_path), *sys.path])
+    process = start(tmp_path, *TRAIN, "--iterations", "1000000", "training.run.save_interval=1000000")
+    deadline = time.monotonic() + 120.0
+    while not list(tmp_path.rglob("events.out.tfevents.*")) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    time.sleep(3.0)
+    (number,) = [n for n in children(process.pid) if rank(n) == str(lost)]
+    os.kill(number, signal.SIGKILL)
+    output, _ = process.communicate(timeout=60)
+    assert process.returncode == 128 + signal.SIGKILL, output
+    (run,) = (tmp_path / "logs" / "rsl_rl" / "go2_flat").iterdir()
+    description = json.loads((run / "run.json").read_text())
+    last = run / f"model_{description['iteration']}.pt"
+    assert description["outcome"] == "lost a process" and description["iteration"] > 0 and last.is_file()
+    here = last.relative_to(tmp_path)
+    assert f"process {lost} of 2, from 0, was killed (SIGKILL); the last checkpoint is '{here}'" in output
+    (tmp_path / "sitecustomize.py").unlink()
+    resumed = start(tmp_path, *TRAIN, "--resume", "latest", "--iterations", str(description["iteration"] + 1))
+    output, _ = resumed.communicate(timeout=300)
+    assert resumed.returncode == 0, output
 
 
 def start_nodes(folder: Path, *command: str) -> list[subprocess.Popen[str]]:

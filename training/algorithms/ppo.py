@@ -267,15 +267,15 @@ class PPO:
 
     # Update
 
-    def update(self, wait: Callable[[], None] = lambda: None) -> dict[str, float]:
-        """Run all passes over the rollout; ``wait`` waits for the device, once all work is asked for. Return means over the minibatches, by
-        name; ``skipped_minibatches`` counts those that were dropped because their gradients were not finite.
+    def update(self, stepped: Callable[[], None] = lambda: None) -> dict[str, float]:
+        """Run all passes over the rollout and call ``stepped`` after every step. Return means over the minibatches, by name;
+        ``skipped_minibatches`` counts those that were dropped because their gradients were not finite.
         """
         storage, settings = self.storage, self.configuration
         storage.step = self.steps = 0
         if (bootstrap := self.bootstrap) is not None:
             self.losses.prepare_student()
-            self.pass_over(storage.minibatch_rows(settings.minibatches), bootstrap.step)
+            self.pass_over(storage.minibatch_rows(settings.minibatches), bootstrap.step, stepped)
             losses = bootstrap.finish()
             self.bootstrap = None if bootstrap.over else bootstrap
             return losses
@@ -283,18 +283,18 @@ class PPO:
         self._student.sums.zero_()
         groups = storage.minibatch_rows(settings.minibatches)
         self.losses.prepare_policy()
-        self.pass_over(groups, self._policy_step)
+        self.pass_over(groups, self._policy_step, stepped)
         self.losses.prepare_student()
-        self.pass_over((storage.student_rows(groups[-1]),), self._student_step)
-        wait()
+        self.pass_over((storage.student_rows(groups[-1]),), self._student_step, stepped)
         return self._report()
 
-    def pass_over(self, groups: Sequence[torch.Tensor], step: Callable[..., None]) -> None:
-        """Take a step on every minibatch of rows, (M, B) for each group, once in each pass."""
+    def pass_over(self, groups: Sequence[torch.Tensor], step: Callable[..., None], stepped: Callable[[], None]) -> None:
+        """Take a step on every minibatch of rows, (M, B) for each group, once in each pass; call ``stepped`` after each."""
         for turned in passes(self.configuration.epochs, alternate=self.configuration.symmetry == "alternate"):
             for minibatch in zip(*groups, strict=True):
                 step(*map(turned, minibatch))
                 self.steps += 1
+                stepped()
 
     def _report(self) -> dict[str, float]:
         """Read the counters back, the update's only wait for the device."""

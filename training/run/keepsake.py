@@ -29,10 +29,15 @@ class Keepsake:
             self._done = torch.cuda.Event()
             self._done.record(torch.cuda.current_stream(device))
 
-    def take(self) -> Mapping[str, Any] | None:
-        """Return the copy, None if there is none."""
+    def settle(self) -> None:
+        """Wait until the copy is complete; from then on ``take`` asks nothing of the device."""
         if self._done is not None:
             self._done.synchronize()
+            self._done = None
+
+    def take(self) -> Mapping[str, Any] | None:
+        """Return the copy, None if there is none."""
+        self.settle()
         return self._copy
 
 
@@ -46,7 +51,7 @@ def host_copy(tree: Mapping[str, Any], device: torch.device | str) -> Mapping[st
 
 def _copied(tree: Any, into: Any) -> Any:
     if isinstance(tree, torch.Tensor):
-        if not isinstance(into, torch.Tensor):
+        if not isinstance(into, torch.Tensor) or into.shape != tree.shape:
             into = torch.empty(tree.shape, dtype=tree.dtype, device="cpu", pin_memory=tree.is_cuda)
         return into.copy_(tree.detach(), non_blocking=True)
     if isinstance(tree, Mapping):

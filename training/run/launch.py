@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import sys
 import time
@@ -24,7 +25,7 @@ from ..algorithms.symmetry import build_mirror
 from ..configuration import ConfigurationError
 from ..environment.configuration import EnvironmentConfiguration
 from ..environment.environment import TrainingEnvironment
-from ..processes import Processes, ProcessLostError
+from ..processes import RUN_TOLD, Processes, ProcessLostError
 from .checkpoint import CheckpointError
 from .filming import Filmer
 from .page import write_page
@@ -107,6 +108,8 @@ def _open_run(
     settings = plan.task.training.run
     run = plan.run or new_run_directory(plan.request.log_root, settings.experiment, settings.run_name)
     closing.callback(_remove_unused, run)
+    if Processes.told().several and (told := os.environ.get(RUN_TOLD)):
+        Path(told).write_text(str(run))
     started(run)
     if plan.notice:
         message(plan.notice)

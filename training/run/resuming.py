@@ -65,12 +65,13 @@ def save_run(run: RunState, path: Path) -> None:
         checkpoint.write_checkpoint(checkpoint.rank_file(path, run.processes.rank), local)
         return
     learned = host_copy(run.learned(), run.device)
-    write_learned(run, path, learned, local | {"world_size": run.processes.count})
+    progress = float(getattr(run.env, "progress", 1.0))
+    write_learned(run, path, learned, local | {"world_size": run.processes.count, "progress": progress})
     run.logger.send(path, run.iteration)
 
 
 def write_learned(run: RunState, path: Path, learned: Mapping[str, Any], local: Mapping[str, Any]) -> None:
-    """Write a checkpoint of learned networks, in the host's memory, and of this process's own state.
+    """Write a checkpoint of learned networks, in the host's memory, and of this process's own state with ``progress``.
 
     Raises:
         TrainingDivergedError: a weight is not finite.
@@ -86,7 +87,7 @@ def write_learned(run: RunState, path: Path, learned: Mapping[str, Any], local: 
         "version": checkpoint.TRAINING_VERSION,
         "task": run.task,
         "settings": run.settings,
-        "progress": float(getattr(run.env, "progress", 1.0)),
+        "progress": float(local["progress"]),
         "best_score": run.best_score,
         "best_iteration": run.best_iteration,
     }

@@ -84,10 +84,10 @@ class TrainingRunner(RunState):
         obs = self._begin()
         total, reason, written = self.iteration + iterations, "finished", None
         fitted = Fit(self, total, max_seconds) if fit and max_seconds is not None else None
-        with StopSignals(self.message) as signals:
+        with StopSignals(self.message) as signals, self.rescue.on_watch(begin):
             try:
                 while self.iteration < total:
-                    obs = self._iterate(obs, lambda: signals.received is not None)
+                    obs = self._iterate(obs)
                     if fitted is not None and max_seconds is not None:
                         total = fitted.total(total, begin + max_seconds - time.monotonic())
                     stop = self._agreed_stop(signals, begin, max_seconds)
@@ -100,7 +100,7 @@ class TrainingRunner(RunState):
                     if ends and self.iteration < total:
                         obs = self._next_stretch()
             except ProcessLostError as error:
-                raise self.rescue.write(error, begin) from error
+                raise self.rescue.write(error) from error
             except BaseException as error:
                 # Other processes that are left may report better; there may be none.
                 self.note("diverged" if isinstance(error, TrainingDivergedError) else "failed")
@@ -171,7 +171,7 @@ class TrainingRunner(RunState):
         )
         return self._first_observations()
 
-    def _iterate(self, obs: TensorDict, stopping: Callable[[], bool]) -> TensorDict:
+    def _iterate(self, obs: TensorDict) -> TensorDict:
         """Do one rollout and one update; returns the next observations."""
         begin = time.perf_counter()
         self._nonfinite.zero_()
@@ -185,7 +185,7 @@ class TrainingRunner(RunState):
             self.alg.compute_returns(obs)
         if (progress := getattr(self.env, "progress", None)) is not None:
             self.alg.follow(progress)
-        losses = self.alg.update(lambda: self.processes.wait_for(self.device, stopping=stopping))
+        losses = self.rescue.watched(self.alg.update)
         self.average.update()
         finished = time.perf_counter()
         self.iteration += 1
