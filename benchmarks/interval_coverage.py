@@ -1,7 +1,7 @@
 """Whether 95 % intervals hold the truth in 95 % of all cases: on whole evaluations that were repeated with fresh seeds, and on
 synthetic ones whose truth is known. And how often a policy is told apart from itself.
 
-    python benchmarks/interval_coverage.py                                    # judge docs/data/repeated_evaluations.json
+    python benchmarks/interval_coverage.py                                    # judge docs/data/repeated_evaluations.json.gz
     python benchmarks/interval_coverage.py --synthetic 1000                   # and 1000 synthetic evaluations of each kind
     python benchmarks/interval_coverage.py --shapes 1000                      # 1000 of gaitgauge-1 for each shape of the pass curve
     python benchmarks/interval_coverage.py --record 30 --folder /tmp/repeated # play the evaluations again, and write the data
@@ -15,6 +15,7 @@ their mean.
 from __future__ import annotations
 
 import argparse
+import gzip
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -22,6 +23,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from gaitgauge.files.parsing import read_text
 from gaitgauge.files.writing import write_atomically
 from gaitgauge.gauge.chance.intervals import Chance, Evidence
 from gaitgauge.gauge.chance.level_area import follow_area
@@ -44,7 +46,7 @@ from gaitgauge.gauge.totals import environment_weights
 from gaitgauge.studies.compare.comparison import ComparisonError, compare
 from numpy.typing import NDArray
 
-DATA = Path(__file__).parents[1] / "docs" / "data" / "repeated_evaluations.json"
+DATA = Path(__file__).parents[1] / "docs" / "data" / "repeated_evaluations.json.gz"
 RULES = ChanceRules(
     level_weight=0.09,
     quality_weight=0.19,
@@ -490,7 +492,7 @@ def main() -> None:
     parser.add_argument("--policy", default="pretrained", help="which is played")
     parser.add_argument("--folder", type=Path, help="where they are played")
     parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--data", type=Path, default=DATA)
+    parser.add_argument("--data", type=Path, default=DATA, help="a .json.gz file")
     parser.add_argument("--synthetic", type=int, default=0, metavar="COUNT")
     parser.add_argument(
         "--shapes", type=int, default=0, metavar="COUNT", help="judge shapes of the pass curve, and nothing else"
@@ -511,8 +513,8 @@ def main() -> None:
             parser.error("--record needs a --folder to play in")
         recorded = record(arguments.record, arguments.policy, arguments.folder, arguments.threads)
         text = json.dumps([result.to_data() for result in recorded], separators=(",", ":"))
-        write_atomically(arguments.data, text + "\n", StoreError)
-    recorded = [restored(data) for data in json.loads(arguments.data.read_text())]
+        write_atomically(arguments.data, gzip.compress(text.encode(), mtime=0), StoreError)
+    recorded = [restored(data) for data in json.loads(read_text(arguments.data, "data", StoreError))]
     print(f"{len(recorded)} whole evaluations with fresh seeds\n")
     print(f"{'':24}{'mean':>9}{'1.96 σ':>9}{'printed':>9}{'covered':>9}")
     for name, (mean, reach, printed, held) in judge(recorded).items():

@@ -27,6 +27,7 @@ import import_public_cts
 import make_trot_policy
 import numpy as np
 import torch
+from gaitgauge.files.parsing import read_text
 from gaitgauge.files.writing import write_atomically
 from gaitgauge.gauge.evaluate import Request, evaluate
 from gaitgauge.gauge.report.page import write_report
@@ -152,7 +153,7 @@ def main() -> None:
         parser.error("the card of 'cts' needs the archive of its weights; give --cts, or choose others with --only")
     repeated = None
     if arguments.repeatability is not None:
-        repeated = json.loads(arguments.repeatability.read_text(encoding="utf-8"))
+        repeated = json.loads(read_text(arguments.repeatability, "figures", StoreError))
     arguments.folder.mkdir(parents=True, exist_ok=True)
     arguments.out.mkdir(parents=True, exist_ok=True)
     for name in arguments.only:

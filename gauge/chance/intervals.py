@@ -27,7 +27,7 @@ from .level_curve import expected_levels
 Array = NDArray[np.float64]
 
 _QUALITY_STEP = 0.85
-"""Share of the quality that is left one level higher: 0.84 on waves and 0.79 on obstacles of ``docs/data/repeated_evaluations.json``."""
+"""Share of the quality that is left one level higher: 0.84 on waves and 0.79 on obstacles of ``docs/data/repeated_evaluations.json.gz``."""
 _LEVEL_FREEDOM = 8.0
 """Degrees of freedom of the variance of one environment's level, which rests on a dozen trials: so many keep rare false alarms
 as rare as they should be (``benchmarks/interval_coverage.py --synthetic``)."""

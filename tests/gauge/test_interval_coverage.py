@@ -1,5 +1,6 @@
 """The intervals' promise: 95 of 100 hold the truth, on evaluations that were repeated and on ones whose truth is known."""
 
+import gzip
 import json
 
 import interval_coverage as bench
@@ -9,7 +10,7 @@ import pytest
 
 @pytest.fixture(scope="module")
 def recorded():
-    return [bench.restored(data) for data in json.loads(bench.DATA.read_text())]
+    return [bench.restored(data) for data in json.loads(gzip.decompress(bench.DATA.read_bytes()))]
 
 
 def test_intervals_of_repeated_evaluations_hold_their_mean(recorded):

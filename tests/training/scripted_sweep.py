@@ -1,5 +1,6 @@
 """Runs of a sweep whose trainings and gaugings are one-line programs."""
 
+import gzip
 import json
 import sys
 from pathlib import Path
@@ -13,7 +14,7 @@ from gaitgauge.training.sweep.jobs import Jobs
 from gaitgauge.training.sweep.runs import SweepRun
 
 ROOT = Path(__file__).parents[2]
-CARD = ROOT / "docs" / "data" / "scorecards" / "standing-robogauge-1.1.json"
+CARD = ROOT / "docs" / "data" / "scorecards" / "standing-robogauge-1.1.json.gz"
 ENTRY = SweepEntry(name="one", task="go2-cts")
 SWEEP = Sweep(name="toy", title="A toy", entry=(ENTRY,), backend="fake", training_suite="none")
 
@@ -53,7 +54,7 @@ if {self.entry.name!r} == "damaged": (run / "run.json").write_text("{{")
         return [sys.executable, "-S", "-c", program]
 
     def gauging_command(self, sweep, *, where):
-        card = json.loads(CARD.read_text())
+        card = json.loads(gzip.decompress(CARD.read_bytes()))
         card["suite"]["digest"] = load_suite(sweep.suite).digest
         card["policy"]["file_sha256"] = file_digest(str(self.policy(sweep)))
         (self.folder / "card.json").write_text(json.dumps(card))

@@ -1,5 +1,6 @@
 """What is kept of a sweep's runs: small, enough for a report anywhere, and no second training."""
 
+import gzip
 import json
 import shutil
 from dataclasses import replace
@@ -21,7 +22,7 @@ from gaitgauge.training.sweep.runs import plan_runs
 from torch.utils.tensorboard import SummaryWriter
 
 ROOT = Path(__file__).parents[2]
-CARD = ROOT / "docs" / "data" / "scorecards" / "standing-robogauge-1.1.json"
+CARD = ROOT / "docs" / "data" / "scorecards" / "standing-robogauge-1.1.json.gz"
 SWEEP = Sweep(
     name="toy",
     title="A toy",
@@ -53,7 +54,7 @@ def finished(tmp_path_factory):
     (made / "run.json").write_text(json.dumps(note))
     results = runs[0].folder / "gauge" / "model_3"
     results.mkdir(parents=True)
-    card = json.loads(CARD.read_text())
+    card = json.loads(gzip.decompress(CARD.read_bytes()))
     card["policy"] |= {"path": "/home/me/model_3.pt", "provenance": {"iteration": 3}}
     card["policy"]["file_sha256"] = file_digest(str(made / "model_3.pt"))
     card["provenance"] |= {"host": "lab-7", "command": "gaitgauge evaluate /home/me/model_3.pt"}
@@ -83,7 +84,7 @@ def test_the_report_of_what_was_kept_is_that_of_the_sweep(finished, kept):
         tables.append([{k: v for k, v in row.items() if k not in ("policy", "results")} for row in found["runs"]])
     assert tables[0] == tables[1]
     assert [row["state"] for row in tables[0]] == ["gauged", "unfinished"]
-    assert tables[0][0]["score"] == json.loads(CARD.read_text())["score"]
+    assert tables[0][0]["score"] == json.loads(gzip.decompress(CARD.read_bytes()))["score"]
     assert (finished / "curves.csv").read_text() == (kept / "curves.csv").read_text()
     for row in ("mean reward,2,0.5", "Loss/surrogate,3,-0.5"):
         assert f"one,0,{row}\n" in (kept / "curves.csv").read_text()
