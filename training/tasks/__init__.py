@@ -101,9 +101,6 @@ _PRECISE_GROUND = replace(
     FLAT_TILE,
     # Pay for progress asks for at least the commanded speed; where nothing is to be climbed, tracking pays alone.
     progress=0.0,
-    # A trunk that bobs and rocks is asked for by ground that is to be climbed, not here.
-    vertical_velocity=3.0,
-    roll_pitch_rate=3.0,
     interval=3.0,
     reversal_probability=0.5,
     stationary_probability=2.0,
@@ -134,8 +131,6 @@ _PRECISE = Stretch(
             "environment.terrain.tiles.flat.sigma=0.15",
             "environment.terrain.tiles.flat.linear_tracking=1.5",
             "environment.terrain.tiles.flat.yaw_tracking=1.5",
-            "environment.terrain.tiles.flat.vertical_velocity=6",
-            "environment.terrain.tiles.flat.roll_pitch_rate=6",
             # The fastest commands and their opposites tip a robot over.
             "environment.commands.extreme_probability=0.3",
             "environment.terrain.tiles.flat.stationary_probability=3",
@@ -152,12 +147,7 @@ _ALL_TERRAINS = EnvironmentConfiguration(
     schedule=ScheduleConfiguration(stretches=(_PRECISE,)),
     terrain=TerrainConfiguration(tiles=(*ALL_TILES[:-1], _PRECISE_GROUND)),
     rewards=RewardConfiguration(
-        yaw_tracking=0.75,
-        progress=1.5,
-        vertical_velocity=Ramp(start=-2.0, end=-0.4, begin=0.0, until=0.1),
-        collision=-0.25,
-        foot_regulation=-0.1,
-        foot_height_scale=0.05,
+        yaw_tracking=0.75, progress=1.5, collision=-0.25, foot_regulation=-0.1, foot_height_scale=0.05
     ),
     commands=CommandConfiguration(straight_probability=0.5, heading_gain=1.0, crossing_probability=0.5),
     termination=TerminationConfiguration(stuck=8.0),
