@@ -464,6 +464,10 @@ def test_mistakes():
         )
     with pytest.raises(ValueError, match="num_envs is 0"):
         make(0)
+    with pytest.raises(
+        ValueError, match=r"joints\.moving is waist, but no joint is rigid; set environment\.joints\.rigid"
+    ):
+        make(joints=JointConfiguration(moving=("waist",)))
 
 
 def test_same_seed_same_run():

@@ -92,6 +92,11 @@ class TrainingEnvironment(VecEnv):
             raise ConfigurationError(
                 f"environment.num_envs is {configuration.num_envs}; an environment needs at least 1 world"
             )
+        if configuration.joints.moving and not configuration.joints.rigid:
+            raise ConfigurationError(
+                f"environment.joints.moving is {','.join(configuration.joints.moving)}, but no joint is rigid; set "
+                "environment.joints.rigid=true, or leave moving out"
+            )
         schedule = configuration.schedule
         if not 0.0 <= schedule.begin <= 1.0:
             raise ConfigurationError(
