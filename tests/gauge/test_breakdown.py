@@ -97,6 +97,7 @@ def test_references_that_were_measured_here_are_those_of_the_cards():
     measured = [r for r in reference_table().reference if r.file_sha256]
     for reference in measured:
         card = found[reference.suite, reference.file_sha256]
+        assert card.complete, f"the card of {reference.policy} on {reference.suite} is of {card.coverage.text}"
         assert (reference.score, reference.robot) == (round(card.score, 4), card.robot)
         assert reference.interval == (card.score_interval and tuple(round(end, 4) for end in card.score_interval))
     current = {(name, sha) for (name, sha), c in found.items() if c.suite.version == load_suite(name).version}
@@ -112,7 +113,7 @@ def test_which_scores_compare_is_said_with_an_example_that_does_not():
     go1 = comparable(result(robot="go1"))
     assert go1 == (
         "this score compares only with scores of robogauge-1.1 1.1.0 for the robot go1 on the engine mujoco; other suites have "
-        "other scales: pretrained-go1 has 0.6826 on robogauge-1.1 1.1.0 and 0.4552 on gaitgauge-1 1.1.0"
+        "other scales: pretrained-go1 has 0.6826 on robogauge-1.1 1.1.0 and 0.6645 on gaitgauge-1 1.1.0"
     )
     assert comparable(result(robot="mine")).endswith("for the robot mine on the engine mujoco")
     assert [r.policy for r in references_for(result(robot="go1"))] == ["pretrained-go1"]
