@@ -86,7 +86,8 @@ def film_scenario(path: Path, prepared: PreparedSearch, scenario: Scenario, plac
 
     make = partial(prepared.engine.worlds, threads=1)
     run_each(prepared.loaded.policy, robot, [(scenario, 0)], backend=make, device=prepared.engine.device, watch=watch)
-    model = visual_model(robot, scenario.terrain(), quality)
+    load = None if scenario.payload is None else (scenario.payload.kilograms, scenario.payload.place)
+    model = visual_model(robot, scenario.terrain(), quality, load)
     tile = Tile(
         model=model,
         heading=scenario.start.yaw,

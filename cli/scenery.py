@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import mujoco
@@ -22,12 +23,20 @@ _FLOOR_REACH = 40.0
 """Half extent of the drawn floor [m]."""
 _SAME_GROUND = 0.01
 """Difference in height that nobody sees [m]."""
+LOAD_COLOR = (0.93, 0.55, 0.16, 1.0)
+_LOAD_DENSITY = 1000.0
+"""Density of the drawn load [kg/m³], that of water: its size tells its mass."""
 _EXTENT = 3.0
 """Size of the scene for MuJoCo's camera and shadows [m]."""
 
 
-def visual_model(robot: Robot, terrain: Terrain, quality: Quality = RICH) -> mujoco.MjModel:
-    """Return a model of robot, terrain, sky and light, with the robot's ``qpos``; walls, which would hide the robot, are left out."""
+def visual_model(
+    robot: Robot, terrain: Terrain, quality: Quality = RICH, load: tuple[float, Sequence[float]] | None = None
+) -> mujoco.MjModel:
+    """Return a model of robot, terrain, sky and light, with the robot's ``qpos``; walls, which would hide the robot, are left out.
+
+    ``load``: a mass on the base [kg] and its place from the base's centre of mass [m], drawn as a cube of water.
+    """
     spec = mujoco.MjSpec.from_file(str(robot.mjcf))
     _set_light(spec, quality)
     for i, box in enumerate(box for box in terrain.boxes if not box.wall):
@@ -48,6 +57,13 @@ def visual_model(robot: Robot, terrain: Terrain, quality: Quality = RICH) -> muj
     for geom in list(spec.geoms):
         if geom.group == COLLISION_GROUP and complete:
             spec.delete(geom)
+    if load is not None and load[0] > 0.0:
+        mass, offset = load
+        middle = spec.compile().body(robot.base_body).ipos + np.asarray(offset)
+        half = [0.5 * (mass / _LOAD_DENSITY) ** (1.0 / 3.0)] * 3
+        unseen = {"contype": 0, "conaffinity": 0, "mass": 0.0, "group": VISUAL_GROUP}
+        cube = {"name": "load", "type": mujoco.mjtGeom.mjGEOM_BOX, "size": half, "pos": middle, "rgba": LOAD_COLOR}
+        spec.body(robot.base_body).add_geom(**cube, **unseen)
     return spec.compile()
 
 

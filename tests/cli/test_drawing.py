@@ -159,3 +159,13 @@ def test_shapes_that_collide_are_drawn_where_the_robot_has_few_others(tmp_path, 
     (tmp_path / "robot.xml").write_text(f"<mujoco><worldbody>{bodies}</worldbody></mujoco>")
     model = visual_model(replace(load_robot("go2"), mjcf=tmp_path / "robot.xml"), make_terrain("flat"), PLAIN)
     assert {int(model.geom_group[g]) for g in range(model.ngeom) if model.geom_bodyid[g]} == groups
+
+
+def test_a_load_is_drawn_in_its_place_and_size():
+    robot = load_robot("go2")
+    bare, loaded = (visual_model(robot, make_terrain("flat"), PLAIN, load) for load in (None, (8.0, (0.1, -0.05, 0.2))))
+    cube = loaded.geom("load")
+    base = loaded.body(robot.base_body)
+    assert loaded.ngeom == bare.ngeom + 1 and cube.bodyid[0] == base.id
+    assert cube.size == pytest.approx([0.1] * 3), "8 kg of water"
+    assert cube.pos - base.ipos == pytest.approx([0.1, -0.05, 0.2])
