@@ -97,7 +97,7 @@ def measure(run: Path, options: argparse.Namespace) -> Times:
     policies = {
         int(found[1]): path
         for path in sorted(run.glob("model_*.pt"))
-        if (found := re.match(r"model_(\d+)\.", path.name))
+        if (found := re.fullmatch(r"model_(\d+)(\.gauge)?\.pt", path.name))
     }
     points = []
     for iteration in sorted(policies):

@@ -24,10 +24,11 @@ def run(tmp_path, monkeypatch):
             "Perf/total_steps", 100.0 * (iteration + 1), iteration, walltime=BEGAN + 60.0 + 30.0 * iteration
         )
     writer.close()
-    for iteration in (2, 4, 6):
-        (folder / f"model_{iteration}.pt").touch()
-    scores = {"model_2": 0.4, "model_4": 0.66, "model_6": 0.64}
-    card = lambda policy, place, options: type("Card", (), {"score": scores[place.name]})()  # noqa: E731
+    names = ["model_2.pt", "model_2.rank1.pt", "model_4.pt", "model_4.rank1.pt", "model_6.gauge.pt", "last.gauge.pt"]
+    for name in names:
+        (folder / name).touch()
+    scores = {"model_2.pt": 0.4, "model_4.pt": 0.66, "model_6.gauge.pt": 0.64}
+    card = lambda policy, place, options: type("Card", (), {"score": scores[policy.name]})()  # noqa: E731
     monkeypatch.setattr(time_to_score, "card_of", card)
     return folder
 
