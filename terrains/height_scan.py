@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from .base import Terrain
+from .height import grid_height
 
 
 class HeightRasters:
@@ -26,10 +27,9 @@ class HeightRasters:
         self.half_size = steps * cell
         self.nodes = 2 * steps + 1
         axis = np.linspace(-self.half_size, self.half_size, self.nodes)
-        y, x = np.meshgrid(axis, axis, indexing="ij")
         heights = np.empty((len(terrains), self.nodes, self.nodes), dtype=np.float32)
         for i, terrain in enumerate(terrains):
-            heights[i] = terrain.height(x, y)
+            heights[i] = grid_height(terrain.boxes, terrain.height_field, axis)
         self._heights = torch.from_numpy(heights).to(device).reshape(-1)
 
     def height(self, terrain_index: torch.Tensor, points_xy: torch.Tensor) -> torch.Tensor:

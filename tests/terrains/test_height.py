@@ -4,6 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 from gaitgauge.terrains import Box, HeightField, Terrain, make_terrain
+from gaitgauge.terrains.height import grid_height, ground_height
 from gaitgauge.terrains.training_tiles import TILE_KINDS, make_tile
 
 
@@ -144,3 +145,22 @@ def test_shapes_broadcast_and_nan_stays_nan(rough):
 def test_edges_belong_to_the_solid():
     bar = make_terrain("obstacle", 10)
     assert bar.height(np.array([5.0, 6.0]), np.array([5.0, -5.0])) == pytest.approx(0.28)
+
+
+def test_a_grid_has_the_same_bits_as_its_points():
+    """On every kind of tile, and with boxes turned any way, of which some lie half or wholly outside of the grid."""
+    axis = np.linspace(-4.95, 4.95, 199)
+    y, x = np.meshgrid(axis, axis, indexing="ij")
+    tiles = [make_tile(kind, 7, 3) for kind in TILE_KINDS]
+    assert any(t.height_field is not None for t in tiles)
+    random = np.random.default_rng(5)
+    boxes = [
+        Box(
+            center=tuple(random.uniform([-6, -6, 0], [6, 6, 0.5])),
+            half_size=tuple(random.uniform(0.02, 1.0, 3)),
+            quaternion=tuple(q / np.linalg.norm(q)),
+        )
+        for q in random.normal(size=(40, 4))
+    ]
+    for found, field in [(boxes, None), *((t.boxes, t.height_field) for t in tiles)]:
+        np.testing.assert_array_equal(grid_height(found, field, axis), ground_height(found, field, x, y))
