@@ -53,6 +53,22 @@ def moving(model, worlds=16):
     return m, d
 
 
+def rows_in_order(types, numbers, geoms):
+    """Indices that order each world's rows by kind and by joint or geom: on a GPU contacts take their places as its threads arrive."""
+    of_contact = types >= int(mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS)
+    owners = np.where(of_contact, geoms.max(axis=1)[np.where(of_contact, numbers, 0)], numbers)
+    return np.stack([np.lexsort((owner, kind)) for owner, kind in zip(owners, types, strict=True)])
+
+
+def test_rows_do_not_depend_on_the_order_of_contacts():
+    kinds = mujoco.mjtConstraint
+    friction, contact = int(kinds.mjCNSTR_FRICTION_DOF), int(kinds.mjCNSTR_CONTACT_ELLIPTIC)
+    types = np.array([[friction, friction, contact, contact, contact, contact]] * 2)
+    geoms = np.array([[0, 7], [0, 5], [0, 5], [0, 7]])  # the second world found them the other way round
+    numbers = np.array([[6, 7, 0, 0, 1, 1], [7, 6, 2, 2, 3, 3]])
+    assert rows_in_order(types, numbers, geoms).tolist() == [[0, 1, 4, 5, 2, 3], [1, 0, 2, 3, 4, 5]]
+
+
 def solved(model, function, *, device="cpu", monkeypatch=None):
     """Accelerations, constraint forces by degree of freedom and row, states, and iterations."""
     with wp.ScopedDevice(device):
@@ -60,11 +76,12 @@ def solved(model, function, *, device="cpu", monkeypatch=None):
         monkeypatch.setattr(solver, "solve", function)
         mujoco_warp.forward(m, d)
         count = int(d.nefc.numpy()[0])
+        order = rows_in_order(*(a.numpy()[:, :count] for a in (d.efc.type, d.efc.id)), d.contact.geom.numpy())
         return {
             "acceleration": d.qacc.numpy(),
             "joint force": d.qfrc_constraint.numpy(),
-            "row force": d.efc.force.numpy()[:, :count],
-            "state": d.efc.state.numpy()[:, :count],
+            "row force": np.take_along_axis(d.efc.force.numpy()[:, :count], order, axis=1),
+            "state": np.take_along_axis(d.efc.state.numpy()[:, :count], order, axis=1),
             "iterations": d.solver_niter.numpy(),
             "momentum": d.efc.Ma.numpy(),
         }
