@@ -21,6 +21,9 @@ _FALSE_ALARM = 0.01
 _LEAST_SPREAD = 0.02
 """Standard deviation of a run's figure that is supposed at least: a single fall shows in a run what others never have."""
 
+_LEAST_LEVEL = 1.0 / math.sqrt(12.0)
+"""Standard error of a level that bisection finds, at least: that of rounding. All seeds at the last level leave 0.07 by the fit."""
+
 Rows = Sequence[tuple[EnvironmentRow, EnvironmentRow]]
 """Pairs of environments: of the card and of the replay."""
 Quantity = tuple[str, float, float, float]
@@ -61,7 +64,8 @@ def _quantities(scope: str, pairs: Rows, rules: ChanceRules) -> Iterator[Quantit
         weights = np.full(len(levelled), 1.0 / len(levelled))
         chance = Evidence([new for _, new in levelled], rules).level_chance(weights)
         difference = float(np.mean([old.reached - new.reached for old, new in levelled]))
-        yield f"level{scope}", difference, math.sqrt(2.0) * chance.error, chance.freedom
+        least = _LEAST_LEVEL / math.sqrt(len(levelled)) if rules.level == "bisection" else 0.0
+        yield f"level{scope}", difference, math.sqrt(2.0) * max(chance.error, least), chance.freedom
     tables = [tables for pair in pairs if (tables := _at_one_level(*pair))]
     if not tables:
         return

@@ -8,6 +8,7 @@ from gaitgauge.gauge.evaluate import Request, identity, prepare
 from gaitgauge.gauge.result import Motors
 from gaitgauge.gauge.result_figures import check_figures
 from gaitgauge.gauge.suite import load_suite
+from gaitgauge.studies.cards.agreement import figures_that_are_off
 from gaitgauge.studies.cards.verify import CardError, check_card, judge, prepare_replay, with_fresh_seeds
 from gaitgauge.studies.compare.comparison import ComparisonError, load_result
 from gaitgauge.studies.policies import file_digest
@@ -93,6 +94,21 @@ def test_levels_that_differ_are_listed(card):
     (found,) = judge(card, with_row(card, 3, level=level - 1))["levels"]
     place = {"terrain": "wave", "friction": 0.6, "payload": 0.0}
     assert found == place | {"card": level, "here": level - 1}
+
+
+def test_a_search_that_ends_at_the_last_level_is_no_more_exact_than_its_levels(card):
+    """All seeds pass level 10 here, and two of four did on the card: chance (Fisher's p is 0.43), and the card was refused."""
+    passed = dict.fromkeys(range(4), True)
+
+    def off(level, last):
+        old, new = (
+            replace(card.environments[3], level=at, trials={5: passed, 8: passed, at: passed} | end, search={at: True})
+            for at, end in ((level, last), (10, {}))
+        )
+        return [name for name in figures_that_are_off([(old, new)], card.chance) if name.startswith("level")]
+
+    assert off(9, {10: {0: False, 1: True, 2: True, 3: False}}) == []
+    assert off(6, {7: dict.fromkeys(range(4), False)}) == ["level"]
 
 
 def test_a_sample_is_held_against_the_same_environments(card):
