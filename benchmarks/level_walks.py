@@ -4,9 +4,9 @@
 
 Eight robots side by side: standing, forward, backward at half of the limit (many policies have a smaller one there), left, right,
 turning both ways, and an arc at half of the limits. Motors have the gains of the policy's contract and the torque limits of
-``gaitgauge-1``. Deviations from the mean, RMS: ``bobs``, the vertical speed; ``rocks``, roll and pitch rate; ``sways``, the yaw rate
-[m/s, rad/s]. ``--moving`` makes the joints that the policy does not drive
-rigid but for those of the roles given; ``none`` makes all rigid. The exit code is 1 if one falls.
+``gaitgauge-1``. Three columns are deviations from the mean, RMS: ``bobs``, of the vertical speed [m/s]; ``rocks``, of the roll and pitch
+rates, and ``sways``, of the yaw rate [rad/s]. ``--moving`` makes the joints that the policy does not drive rigid but for those of the
+roles given; ``none`` makes all rigid. The exit code is 1 if one falls.
 """
 
 from __future__ import annotations

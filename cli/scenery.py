@@ -19,11 +19,11 @@ COLLISION_GROUP = 3
 FIELD_COLOR = (0.72, 0.76, 0.74, 1.0)
 BOX_COLORS = ((0.66, 0.70, 0.76, 1.0), (0.58, 0.62, 0.69, 1.0))
 """Neighbouring boxes differ a little, so that steps can be told apart."""
+LOAD_COLOR = (0.93, 0.55, 0.16, 1.0)
 _FLOOR_REACH = 40.0
 """Half extent of the drawn floor [m]."""
 _SAME_GROUND = 0.01
 """Difference in height that nobody sees [m]."""
-LOAD_COLOR = (0.93, 0.55, 0.16, 1.0)
 _LOAD_DENSITY = 1000.0
 """Density of the drawn load [kg/m³], that of water: its size tells its mass."""
 _EXTENT = 3.0
