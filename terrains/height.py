@@ -36,8 +36,8 @@ def ground_height(boxes: Sequence[Box], height_field: HeightField | None, x: Flo
 
 
 def grid_height(boxes: Sequence[Box], height_field: HeightField | None, axis: FloatArray) -> FloatArray:
-    """Return ``ground_height`` at the nodes of a square grid, (y, x), of the same ascending coordinates on both axes, (n,) [m]; a box is
-    looked at where it may stand only, a small part of the grid.
+    """Return ``ground_height`` at the nodes of a square grid, (y, x), of the same ascending coordinates on both axes, (n,) [m]. Each
+    box is evaluated at the few nodes that it may cover.
     """
     x, y = axis[None, :], axis[:, None]
     height: FloatArray = np.zeros((len(axis), len(axis)))
