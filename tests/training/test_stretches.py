@@ -21,7 +21,7 @@ from gaitgauge.training.run.request import TrainRequest
 from gaitgauge.training.run.resuming import resume_run
 from gaitgauge.training.run.runner import TrainingRunner
 from gaitgauge.training.run.seeding import seed_everything
-from gaitgauge.training.tasks import find_task, scaling
+from gaitgauge.training.tasks import TaskError, find_task, scaling
 from gaitgauge_fake_engine import FakeBackend, FakeScript
 from small_environment import STAIRS, idle, make
 from toy_training import toy_configuration
@@ -185,6 +185,28 @@ def test_a_setting_of_the_command_line_holds_in_every_stretch():
     given = find_task("go2-moe-cts", ["environment.physics.cone=pyramidal"]).environment
     assert settings_in(own, 1).physics.cone == "elliptic" and settings_in(own, 0).physics.cone == "pyramidal"
     assert settings_in(given, 1).physics == replace(settings_in(own, 1).physics, cone="pyramidal")
+
+
+def test_a_setting_of_one_stretch_holds_in_it_alone():
+    """Beside the same one for the whole run, which leaves the stretch out otherwise."""
+    sigma = "environment.terrain.tiles.flat.sigma"
+    given = find_task("go2-moe-cts", [f"{sigma}=0.75", f"precise: {sigma} = 0.5"]).environment
+    tiles = [settings_in(given, stretch).terrain.tiles[-1] for stretch in (0, 1)]
+    assert [(tile.name, tile.sigma) for tile in tiles] == [("flat", 0.75), ("flat", 0.5)]
+    assert settings_in(given, 1).physics == settings_in(find_task("go2-moe-cts").environment, 1).physics
+
+
+@pytest.mark.parametrize(
+    ("task", "setting", "words"),
+    [
+        ("go2-cts", "late:environment.seed=1", "is for stretch 'late'; its stretches are: precise"),
+        ("go2-flat", "precise:environment.seed=1", "is for stretch 'precise'; the task has no stretches"),
+        ("go2-cts", "precise:environment.seed", "is no setting of a stretch; write precise:environment.…=value"),
+    ],
+)
+def test_a_setting_of_no_stretch_is_refused(task, setting, words):
+    with pytest.raises(TaskError, match=words):
+        find_task(task, [setting])
 
 
 def test_the_iterations_that_fit_are_those_of_both_stretches():

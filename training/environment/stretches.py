@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 from ...files.parsing import shown
@@ -10,7 +11,7 @@ from ...policy.contract import PolicyContract
 from ...robots.base import Robot
 from ...terrains.training_tiles import TILE_KINDS
 from ..configuration import ConfigurationError
-from ..overrides import apply_overrides
+from ..overrides import TaskError, apply_overrides
 from .configuration import EnvironmentConfiguration, ScheduleConfiguration
 
 CHANGEABLE = ("commands", "physics", "push", "randomization", "reset", "rewards", "termination", "terrain")
@@ -107,3 +108,21 @@ def without(configuration: EnvironmentConfiguration, keys: set[str]) -> Environm
         for each in schedule.stretches
     )
     return replace(configuration, schedule=replace(schedule, stretches=kept))
+
+
+def with_own(configuration: EnvironmentConfiguration, given: Iterable[str]) -> EnvironmentConfiguration:
+    """Return the configuration with settings of single stretches, each ``STRETCH:key=value``, after those that the stretch has. Raises
+    TaskError: no such stretch, or no setting.
+    """
+    stretches = {each.name: each for each in configuration.schedule.stretches}
+    for setting in given:
+        name, _, own = map(str.strip, setting.partition(":"))
+        if name not in stretches:
+            known = f"its stretches are: {', '.join(stretches)}" if stretches else "the task has no stretches"
+            raise TaskError(f"{shown(setting)} is for stretch {shown(name)}; {known}")
+        if "=" not in own:
+            raise TaskError(f"{shown(setting)} is no setting of a stretch; write {name}:environment.…=value")
+        key = own.split("=", 1)[0].strip()
+        kept = [each for each in stretches[name].settings.split() if each.split("=", 1)[0] != key]
+        stretches[name] = replace(stretches[name], settings=" ".join((*kept, "".join(own.split()))))
+    return replace(configuration, schedule=replace(configuration.schedule, stretches=tuple(stretches.values())))

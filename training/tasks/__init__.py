@@ -27,7 +27,7 @@ from ..environment.configuration import (
     TerminationConfiguration,
 )
 from ..environment.reward_configuration import RewardConfiguration
-from ..environment.stretches import without
+from ..environment.stretches import with_own, without
 from ..environment.terrain_configuration import ALL_TILES, FLAT_TILE, TerrainConfiguration
 from ..overrides import TaskError, apply_overrides
 from . import biped
@@ -52,15 +52,19 @@ class Task:
     """Suite that scores its checkpoints where a command names none."""
 
     def with_overrides(self, overrides: Iterable[str]) -> Task:
-        """Return the task with some settings changed: ``environment.…`` and ``training.…`` keys.
+        """Return the task with some settings changed: ``environment.…`` and ``training.…`` keys, ``STRETCH:environment.…`` for those of
+        one stretch.
 
         Raises:
             TaskError: a key or value that does not fit.
         """
-        given = list(overrides)
+        given, own = [], []
+        for setting in overrides:
+            (own if ":" in setting.split("=", 1)[0] else given).append(setting)
         settings = apply_overrides(_Settings(environment=self.environment, training=self.training), given)
         keys = {setting.split("=", 1)[0].strip() for setting in given}
-        return replace(self, environment=without(settings.environment, keys), training=settings.training)
+        environment = with_own(without(settings.environment, keys), own)
+        return replace(self, environment=environment, training=settings.training)
 
     def for_robot(self, source: str) -> Task:
         """Return the task for another robot than its own, a name or the path of a description, scaled by its sizes.
@@ -423,7 +427,8 @@ def find_task(name: str, overrides: Iterable[str] = (), *, robot: str | None = N
 
     Args:
         name: one of ``TASKS`` or ``GROUNDS``, or ``module:attribute`` of a ``Task`` of one's own.
-        overrides: ``environment.…=value`` and ``training.…=value``, which change what is scaled for the robot.
+        overrides: ``environment.…=value`` and ``training.…=value``, which change what is scaled for the robot;
+            ``STRETCH:environment.…=value`` for one stretch.
         robot: name or path of a robot; None for the task's own.
 
     Raises:
