@@ -1,11 +1,15 @@
 """The average of the weights over the later part of a run."""
 
+from dataclasses import replace
+
+import mean_policy
 import pytest
 import torch
+from gaitgauge.policy.contract import PolicyContract
 from gaitgauge.policy.loading import load_policy
 from gaitgauge.training.configuration import ConfigurationError
 from gaitgauge.training.run.averaging import WeightAverage
-from gaitgauge.training.run.checkpoint import learned_networks, read_checkpoint, trim_checkpoint
+from gaitgauge.training.run.checkpoint import learned_networks, read_checkpoint, trim_checkpoint, write_checkpoint
 from gaitgauge.training.run.resuming import begin_with, resume_run, stored_network
 from gaitgauge.training.run.runner import TrainingRunner
 from gaitgauge.training.run.seeding import seed_everything
@@ -100,3 +104,27 @@ def test_a_checkpoint_without_an_average_is_continued(tmp_path):
     assert said == [f"'{tmp_path / 'old.pt'}' holds no average of weights: it begins here."]
     raw = entries["actor_state_dict"]["student.actor.0.weight"]
     assert torch.equal(stored_network(resumed).state_dict["actor.0.weight"], raw)
+
+
+def test_the_mean_of_policies_may_be_of_a_part_and_knows_the_physics_of_all(tmp_path, monkeypatch):
+    """By hand: what has "encoder" in its name is half of both files, the rest that of the last."""
+    physics = ({"trained": [{"engine": "a"}], "tuned": []}, {"trained": [{"engine": "b"}], "tuned": []})
+    for name, seed, each in zip("ab", (0, 1), physics, strict=True):
+        made = runner(tmp_path / name, seed=seed)
+        made.learn(1)
+        entries = read_checkpoint(tmp_path / name / "model_1.pt")
+        contract = PolicyContract.from_json(entries["contract"])
+        contract = replace(contract, provenance={**contract.provenance, "physics": each})
+        write_checkpoint(tmp_path / f"{name}.pt", entries | {"contract": contract.to_json()})
+    a, b, out = (tmp_path / name for name in ("a.pt", "b.pt", "mean.gauge.pt"))
+    monkeypatch.setattr("sys.argv", ["mean_policy.py", str(out), str(a), str(b), "--only", "encoder"])
+    mean_policy.main()
+    first, last, mean = (learned_networks(read_checkpoint(file))["actor_state_dict"] for file in (a, b, out))
+    parts = {"encoder" in name for name in mean}
+    assert parts == {True, False}
+    for name, value in mean.items():
+        expected = (first[name] + last[name]) / 2 if "encoder" in name else last[name]
+        assert torch.allclose(value, expected), name
+    said = PolicyContract.from_json(read_checkpoint(out)["contract"]).provenance
+    assert [engine["engine"] for engine in said["physics"]["trained"]] == ["a", "b"]
+    assert said["mean_of_part"] == "encoder" and len(said["mean_of"]) == 2

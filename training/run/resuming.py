@@ -211,16 +211,23 @@ def _begin(run: RunState, path: Path, entries: Mapping[str, Any]) -> None:
 def remember_physics(run: RunState, theirs: PolicyContract) -> None:
     """Note the physics of the policy that a run begins or goes on with before the run's own, in the provenance of its policies."""
     own, earlier = (contract.provenance.get(PHYSICS) for contract in (run.contract, theirs))
-    if not isinstance(own, Mapping):
-        return
-    before = earlier if isinstance(earlier, Mapping) else {"note": _UNKNOWN_PHYSICS}
-    both = {name: [*before.get(name, ()), *own.get(name, ())] for name in ("trained", "tuned")}
-    merged: dict[str, Any] = {
+    if isinstance(own, Mapping):
+        before = earlier if isinstance(earlier, Mapping) else {"note": _UNKNOWN_PHYSICS}
+        run.contract = replace(
+            run.contract, provenance={**run.contract.provenance, PHYSICS: joined_physics(before, own)}
+        )
+
+
+def joined_physics(*each: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what the provenances of some policies say of physics as that of one policy that comes from all: every engine once, and the
+    first note.
+    """
+    both = {name: [engine for physics in each for engine in physics.get(name, ())] for name in ("trained", "tuned")}
+    joined: dict[str, Any] = {
         name: [e for at, e in enumerate(all_) if e not in all_[:at]] for name, all_ in both.items()
     }
-    if note := before.get("note"):
-        merged["note"] = note
-    run.contract = replace(run.contract, provenance={**run.contract.provenance, PHYSICS: merged})
+    notes = [physics["note"] for physics in each if physics.get("note")]
+    return joined | ({"note": notes[0]} if notes else {})
 
 
 _UNKNOWN_PHYSICS = "the file of the policy that its training began with does not say in which physics that was trained"
