@@ -8,7 +8,7 @@ with the policy's name in place of its path and without the machine's name, with
 another machine must lie, and with the repeatability of its suite (``--repeatability``). Weights of others are not written to
 ``--out``: of the CTS policy and the zoo's their cards alone. ``--public`` is a folder with public files that the zoo knows, under
 any name, and takes those for the Go2. ``--only`` and ``--suite`` choose, so that several processes can share the work;
-``--terrain`` and ``--friction`` take a part for a first try.
+``--terrain`` and ``--friction`` take a part for a first try, whose card is named so.
 
 ``--made`` plays nothing: cards are made of the results that the folder holds, on this machine or on another that was given the
 folder. ``--commit`` says which commit played, where the machine that played had the source without its repository.
@@ -162,7 +162,8 @@ def main() -> None:
             result = load_result(run) if arguments.made else play(name, suite, run, arguments)
             card = card_of(result, name, repeated, arguments.commit)
             text = json.dumps(card, separators=(",", ":"), ensure_ascii=False) + "\n"
-            write_atomically(arguments.out / f"{run.name}.json.gz", gzip.compress(text.encode(), mtime=0), StoreError)
+            file = f"{run.name}{'' if result.complete else '-part'}.json.gz"
+            write_atomically(arguments.out / file, gzip.compress(text.encode(), mtime=0), StoreError)
             low, high = card["tolerance"] or (float("nan"),) * 2
             where = "" if result.complete else f" ({result.coverage.text})"
             print(f"{name} {suite}: {result.score:.4f}, a replay within {low:.4f} to {high:.4f}{where}", flush=True)
