@@ -7,7 +7,6 @@
 Checkpoints of one run, or of runs that went on from each other, lie close enough for that (``training/run/averaging.py``). A file that
 is named twice weighs twice. ``--only encoder`` averages what has that in its name, and takes the rest from the last file. Contract, task
 and progress are those of the last file; its provenance gets ``mean_of``, run and iteration of every file, and the physics of all.
-``--chosen-by SUITE`` notes that this mean was chosen among others by its scores in MuJoCo.
 """
 
 from __future__ import annotations
@@ -18,7 +17,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
-from gaitgauge.files.provenance import versions
 from gaitgauge.policy.contract import PHYSICS, PolicyContract
 from gaitgauge.training.run.checkpoint import learned_networks, read_checkpoint, student_state, write_checkpoint
 from gaitgauge.training.run.resuming import joined_physics
@@ -43,7 +41,6 @@ def main() -> None:
     parser.add_argument("out", type=Path)
     parser.add_argument("policies", type=Path, nargs="+", help="files of gaitgauge import --trainable, or checkpoints")
     parser.add_argument("--only", default="", help="average the tensors with this in their names")
-    parser.add_argument("--chosen-by", metavar="SUITE")
     arguments = parser.parse_args()
     files = [read_checkpoint(path, training_state=False, purpose="average") for path in arguments.policies]
     contracts = [PolicyContract.from_json(entries["contract"]) for entries in files]
@@ -55,11 +52,7 @@ def main() -> None:
     means = [{key: c.provenance.get(key) for key in ("run", "iteration")} for c in contracts]
     made = {"mean_of": means, **({"mean_of_part": arguments.only} if arguments.only else {})}
     unknown = {"note": "one of the averaged files does not say in which physics it was trained"}
-    physics = [contract.provenance.get(PHYSICS) or unknown for contract in contracts]
-    if arguments.chosen_by:
-        judge = {"engine": "mujoco", "version": versions()["mujoco"], "settings": {"suite": arguments.chosen_by}}
-        physics.append({"tuned": [judge]})
-    made[PHYSICS] = joined_physics(*physics)
+    made[PHYSICS] = joined_physics(*(contract.provenance.get(PHYSICS) or unknown for contract in contracts))
     contract = replace(contracts[-1], provenance={**contracts[-1].provenance, **made})
     kept = {name: files[-1][name] for name in ("format", "version", "network", "iter", "training")}
     weights = {"state_dict": student_state(actor), "actor_state_dict": actor, "critic_state_dict": critic}
