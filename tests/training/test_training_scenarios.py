@@ -204,7 +204,7 @@ def test_what_is_left_out_is_said(files, caplog):
 def test_what_falls_in_a_trial_falls_in_training(tmp_path):
     """The shipped policy in MuJoCo, by the gauge's trial and in training worlds: felled by a push, and not by a walk."""
     policy = load_policy("pretrained")
-    hard = Force(direction="left", newtons=(300.0, 300.0), begin=(0.5, 0.5), seconds=(0.3, 0.3))
+    hard = Force(direction="left", newtons=(450.0, 450.0), begin=(0.5, 0.5), seconds=(0.3, 0.3))
     walk = (Leg(seconds=0.5, velocity=(0.0, 0.0, 0.0)), Leg(seconds=1.5, velocity=(0.5, 0.0, 0.0)))
     shoved = replace(PLAIN, name="shoved", commands=walk, forces=(hard,))
     walking = replace(PLAIN, name="walking", commands=walk)
