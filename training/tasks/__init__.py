@@ -58,7 +58,7 @@ class Task:
         Raises:
             TaskError: a key or value that does not fit.
         """
-        given, own = [], []
+        given, own = list[str](), list[str]()
         for setting in overrides:
             (own if ":" in setting.split("=", 1)[0] else given).append(setting)
         settings = apply_overrides(_Settings(environment=self.environment, training=self.training), given)
