@@ -103,15 +103,17 @@ def without(configuration: EnvironmentConfiguration, keys: set[str]) -> Environm
     schedule = configuration.schedule
     if not keys or not schedule.stretches:
         return configuration
-    kept = tuple(
-        replace(each, settings=" ".join(s for s in each.settings.split() if s.split("=", 1)[0] not in keys))
-        for each in schedule.stretches
-    )
+    kept = tuple(replace(each, settings=" ".join(_kept(each, keys))) for each in schedule.stretches)
     return replace(configuration, schedule=replace(schedule, stretches=kept))
 
 
+def _kept(stretch: Stretch, keys: set[str]) -> list[str]:
+    """Return the settings of a stretch but for some, by key."""
+    return [setting for setting in stretch.settings.split() if setting.split("=", 1)[0] not in keys]
+
+
 def with_own(configuration: EnvironmentConfiguration, given: Iterable[str]) -> EnvironmentConfiguration:
-    """Return the configuration with settings of single stretches, each ``STRETCH:key=value``, after those that the stretch has. Raises
+    """Return the configuration with settings of single stretches, each ``STRETCH:key=value``, in place of the stretch's own. Raises
     TaskError: no such stretch, or no setting.
     """
     stretches = {each.name: each for each in configuration.schedule.stretches}
@@ -122,7 +124,6 @@ def with_own(configuration: EnvironmentConfiguration, given: Iterable[str]) -> E
             raise TaskError(f"{shown(setting)} is for stretch {shown(name)}; {known}")
         if "=" not in own:
             raise TaskError(f"{shown(setting)} is no setting of a stretch; write {name}:environment.…=value")
-        key = own.split("=", 1)[0].strip()
-        kept = [each for each in stretches[name].settings.split() if each.split("=", 1)[0] != key]
+        kept = _kept(stretches[name], {own.split("=", 1)[0].strip()})
         stretches[name] = replace(stretches[name], settings=" ".join((*kept, "".join(own.split()))))
     return replace(configuration, schedule=replace(configuration.schedule, stretches=tuple(stretches.values())))
