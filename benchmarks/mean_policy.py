@@ -47,6 +47,8 @@ def main() -> None:
     if len({(contract.hash, repr(entries["network"])) for contract, entries in zip(contracts, files, strict=True)}) > 1:
         parser.error("the policies differ in contract or network; give policies of one task")
     networks = [learned_networks(entries) for entries in files]
+    if not any(arguments.only in name for name in networks[-1]["actor_state_dict"]):
+        parser.error(f"no tensor of the actor has '{arguments.only}' in its name; try encoder or student")
     kinds = ("actor_state_dict", "critic_state_dict")
     actor, critic = (mean([n[kind] for n in networks], arguments.only) for kind in kinds)
     means = [{key: c.provenance.get(key) for key in ("run", "iteration")} for c in contracts]
