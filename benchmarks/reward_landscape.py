@@ -33,9 +33,9 @@ def main() -> None:
     tiles = [tile.name for tile in find_task(arguments.task).environment.terrain.tiles if tile.name != "flat"]
     given = [
         *(f"environment.terrain.tiles.{name}.share=0" for name in tiles),
-        *("environment.terrain.curriculum=false", "environment.terrain.leave_distance=none"),
-        *("environment.push.interval=0", f"environment.schedule.begin={min(arguments.progress, 0.999)}"),
         f"environment.num_envs={len(SHARES) * WORLDS}",
+        "environment.push.interval=0",
+        f"environment.schedule.begin={arguments.progress}",
     ]
     task = find_task(arguments.task, [*given, *arguments.settings])
     environment = TrainingEnvironment(task.environment, backend="mujoco", device="cpu", threads=2, fuse=False)
@@ -49,15 +49,14 @@ def main() -> None:
         speeds.append(inputs.base_linear_velocity_b[:, :2].clone())
         return values
 
-    record.names = pay.names  # type: ignore[attr-defined]
     parts.rewards = record  # type: ignore[assignment]
     contract = environment.contract
     policy = load_policy(arguments.policy, environment.robot)
     if (policy.contract.joint_names, policy.contract.observation) != (contract.joint_names, contract.observation):
         parser.error(f"'{arguments.policy}' observes or drives something else than the task's policies")
     session, share = policy.session(environment.num_envs), torch.tensor(SHARES).repeat_interleave(WORLDS)
-    number = next(i for i, term in enumerate(contract.observation) if term.name == "command")
-    at, scale = sum(contract.term_widths[:number]), torch.tensor(contract.observation[number].scale)
+    term = next(i for i, term in enumerate(contract.observation) if term.name == "command")
+    at, scale = sum(contract.term_widths[:term]), torch.tensor(contract.observation[term].scale)
     observation = environment.get_observations()["policy"]
     for _ in range(round(arguments.seconds / task.environment.physics.control_period)):
         memory.level.fill_(task.environment.terrain.levels - 1)
@@ -67,14 +66,14 @@ def main() -> None:
         seen = observation.clone()
         seen[:, at : at + 3] = share[:, None] * told * scale
         observation = environment.step(session.act(seen))[0]["policy"]
-    means, walked = torch.stack(rewards[SETTLING:]).mean(0), torch.stack(speeds[SETTLING:]).mean(0)
-    by_share = means.view(len(SHARES), WORLDS, -1).mean(1)
-    shown = [i for i in range(len(pay.names)) if bool((by_share[:, i].abs() > 0.02).any())]
+    paid, walked = (
+        torch.stack(values[SETTLING:]).mean(0).view(len(SHARES), WORLDS, -1).mean(1) for values in (rewards, speeds)
+    )
+    shown = [i for i in range(len(pay.names)) if bool((paid[:, i].abs() > 0.02).any())]
     print("asked    walks          total  " + "  ".join(pay.names[i] for i in shown))
-    for number, values in enumerate(by_share):
-        forward, lateral = walked.view(len(SHARES), WORLDS, 2)[number].mean(0).tolist()
+    for asked, (forward, lateral), values in zip(SHARES, walked.tolist(), paid, strict=True):
         terms = "  ".join(f"{float(values[i]):{len(pay.names[i])}.2f}" for i in shown)
-        print(f"{SHARES[number]:5.1f}  {forward:5.2f}, {lateral:5.2f}  {float(values.sum()):7.2f}  {terms}")
+        print(f"{asked:5.1f}  {forward:5.2f}, {lateral:5.2f}  {float(values.sum()):7.2f}  {terms}")
 
 
 if __name__ == "__main__":

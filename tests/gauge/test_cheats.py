@@ -203,7 +203,7 @@ def altered(folder):
 
 @pytest.mark.slow
 def test_walking_as_it_is_earns_what_its_card_says(altered):
-    """Else what is altered of it below is no walking: the seed that is played, between engines that differ in the last bits."""
+    """Else what is altered of it below is no walking. Machines differ in the last bits, and so do their scores."""
     card = json.loads(gzip.decompress(CARD.read_bytes()))
     place = {"terrain": "flat", "friction": 0.6, "payload": 0.0}
     (environment,) = (e for e in card["environments"] if place.items() <= e.items())
