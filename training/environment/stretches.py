@@ -12,7 +12,7 @@ from ...robots.base import Robot
 from ...terrains.training_tiles import TILE_KINDS
 from ..configuration import ConfigurationError
 from ..overrides import TaskError, apply_overrides
-from .configuration import EnvironmentConfiguration, ScheduleConfiguration
+from .configuration import EnvironmentConfiguration, ScheduleConfiguration, Stretch
 
 CHANGEABLE = ("commands", "physics", "push", "randomization", "reset", "rewards", "termination", "terrain")
 """Groups of ``environment`` with settings that a stretch may change; the others belong to the networks or to the whole run."""
