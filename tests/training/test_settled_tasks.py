@@ -16,7 +16,7 @@ def rounded(text):
 
 
 SETTLED = rounded((Path(__file__).parent / "settled_tasks.json").read_text())
-"""Settings of 27 November 2026 by command: all of the first task's, and what is different in the others."""
+"""Settings of 29 November 2026 by command: all of the first task's, and what is different in the others."""
 
 
 def flat(value, path=""):

@@ -103,8 +103,12 @@ class _Settings:
 _MIRRORED = AlgorithmConfiguration(symmetry="augment", student_period=2)
 _PRECISE_GROUND = replace(
     FLAT_TILE,
-    # Pay for progress asks for at least the commanded speed; where nothing is to be climbed, tracking pays alone.
-    progress=0.0,
+    # Told to run, a robot that stands has its whole pay for the yaw rate, and linear tracking is flat that far from the command: pay for
+    # progress and a wide kernel make every faster walk worth more.
+    progress=0.5,
+    sigma=0.75,
+    # A robot that bobs is fast on waves, where vertical speed costs next to nothing; here it costs what the gauge takes off.
+    vertical_velocity=2.5,
     interval=3.0,
     reversal_probability=0.5,
     stationary_probability=2.0,
@@ -127,14 +131,16 @@ _PRECISE = Stretch(
             "environment.randomization.motor_speed=1,5",
             "environment.rewards.joint_speed_limits=-0.15",
             "environment.randomization.friction=0.15,1.25",
-            # The tracking kernels are narrow, level ground pays more for them, and the mean error of a turn on the spot costs most.
+            # The tracking kernels are narrow, level ground pays more for them and less for a trunk that bobs and rocks, and the mean error of
+            # a turn on the spot costs most.
             "environment.rewards.tracking_sigma=0.15",
             "environment.rewards.yaw_tracking=1.5",
             "environment.rewards.turn_error=-4",
             "environment.rewards.turn_error_time=0.3",
-            "environment.terrain.tiles.flat.sigma=0.15",
-            "environment.terrain.tiles.flat.linear_tracking=1.5",
+            "environment.terrain.tiles.flat.linear_tracking=3",
             "environment.terrain.tiles.flat.yaw_tracking=1.5",
+            "environment.terrain.tiles.flat.vertical_velocity=50",
+            "environment.terrain.tiles.flat.roll_pitch_rate=5",
             # The fastest commands and their opposites tip a robot over.
             "environment.commands.extreme_probability=0.3",
             "environment.terrain.tiles.flat.stationary_probability=3",
@@ -151,7 +157,12 @@ _ALL_TERRAINS = EnvironmentConfiguration(
     schedule=ScheduleConfiguration(stretches=(_PRECISE,)),
     terrain=TerrainConfiguration(tiles=(*ALL_TILES[:-1], _PRECISE_GROUND)),
     rewards=RewardConfiguration(
-        yaw_tracking=0.75, progress=1.5, collision=-0.25, foot_regulation=-0.1, foot_height_scale=0.05
+        yaw_tracking=0.75,
+        progress=1.5,
+        vertical_velocity=Ramp(start=-2.0, end=-0.02, begin=0.0, until=0.1),
+        collision=-0.25,
+        foot_regulation=-0.1,
+        foot_height_scale=0.05,
     ),
     commands=CommandConfiguration(straight_probability=0.5, heading_gain=1.0, crossing_probability=0.5),
     termination=TerminationConfiguration(stuck=8.0),
