@@ -131,8 +131,8 @@ _PRECISE = Stretch(
             "environment.randomization.motor_speed=1,5",
             "environment.rewards.joint_speed_limits=-0.15",
             "environment.randomization.friction=0.15,1.25",
-            # The tracking kernels are narrow, level ground pays more for them and less for a trunk that bobs and rocks, and the mean error of
-            # a turn on the spot costs most.
+            # The tracking kernels are narrow, level ground pays more for them and less for a trunk that bobs and rocks, and the mean error
+            # of a turn on the spot costs most.
             "environment.rewards.tracking_sigma=0.15",
             "environment.rewards.yaw_tracking=1.5",
             "environment.rewards.turn_error=-4",
