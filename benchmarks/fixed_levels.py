@@ -3,11 +3,12 @@
     python benchmarks/fixed_levels.py pretrained --kind stairs_up --levels 5 6 7 8 --worlds 32
     python benchmarks/fixed_levels.py pretrained RUN/model_1800.pt --levels 6 8 --ahead 0.8 --terms
 
-The training environment of ``go2-moe-cts`` on MuJoCo, with the schedules at their end; levels never move. The student acts
-without exploration noise. Prints for each level: episodes that would move it up and down, among those that count; the mean share
-of the commanded speed, along the robot's present heading and along the commanded one; how long it heads more than 45 and 90
-degrees off; reward per second; and which rules ended episodes, with how many of the stuck robots walked: had more than half of
-the commanded speed of late along their own heading. Further arguments are settings, as for ``gaitgauge train``.
+The training environment of ``go2-moe-cts`` on MuJoCo, with the schedules at their end, in the last stretch; levels never
+move. The student acts without exploration noise. Prints for each level: episodes that would move it up and down, among those
+that count; the mean share of the commanded speed, along the robot's present heading and along the commanded one; how long it
+heads more than 45 and 90 degrees off; reward per second; and which rules ended episodes, with how many of the stuck robots
+walked: had more than half of the commanded speed of late along their own heading. Further arguments are settings, as for
+``gaitgauge train``.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from gaitgauge.training.environment.memory import EnvironmentMemory
 from gaitgauge.training.environment.randomness import UniformColumns
 from gaitgauge.training.environment.rewards import progress_share
 from gaitgauge.training.environment.step_inputs import StepInputs
+from gaitgauge.training.environment.stretches import settings_in
 from gaitgauge.training.environment.terminations import Ends
 from gaitgauge.training.tasks import find_task
 
@@ -74,13 +76,14 @@ class FixedLevels:
             settings: ``environment.…=value``.
         """
         configuration = find_task("go2-moe-cts", settings).environment
+        configuration = settings_in(configuration, len(configuration.schedule.stretches))
         tiles = tuple(replace(t, share=float(t.name == kind)) for t in configuration.terrain.tiles)
         configuration = replace(
             configuration,
             num_envs=worlds,
             commands=configuration.commands if speeds is None else steady(*speeds),
             terrain=replace(configuration.terrain, tiles=tiles),
-            schedule=replace(configuration.schedule, begin=1.0),
+            schedule=replace(configuration.schedule, begin=1.0, stretches=()),
         )
         self.environment = TrainingEnvironment(configuration, backend="mujoco", device="cpu")
         self.network = load_policy(policy, self.environment.robot).network.eval()

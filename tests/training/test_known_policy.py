@@ -27,6 +27,14 @@ def test_levels_stay_and_commands_lead_straight_ahead():
     assert rows[1] == "    ends: time_out 2"
 
 
+@pytest.mark.slow
+def test_levels_have_the_last_stretch_and_the_commands_of_their_kind():
+    played = FixedLevels("pretrained", kind="stairs_up", levels=(3,), worlds=1, speeds=None, settings=())
+    tiles = played.environment.configuration.terrain.tiles
+    assert [tile.name for tile in tiles if tile.share] == ["stairs_up"], "the stretch has shares of its own"
+    assert played.environment.configuration.rewards.turn_error == -4.0
+
+
 def test_steps_of_another_depth_and_height():
     stairs = ground("stairs", 8, Changes(riser=0.2, tread=0.25))
     assert stairs.height(0.3, 0.0) == pytest.approx(0.4) and stairs.height(0.2, 0.0) == pytest.approx(0.2)
