@@ -103,11 +103,11 @@ class _Settings:
 _MIRRORED = AlgorithmConfiguration(symmetry="augment", student_period=2)
 _PRECISE_GROUND = replace(
     FLAT_TILE,
-    # Told to run, a robot that stands has its whole pay for the yaw rate, and linear tracking is flat that far from the command: pay for
-    # progress and a wide kernel make every faster walk worth more.
+    # Told to run, a robot that stands has its whole pay for the yaw rate, and linear tracking is flat that far from the command. With pay
+    # for progress and a wide kernel, walking fast is worth more than standing.
     progress=0.5,
     sigma=0.75,
-    # A robot that bobs is fast on waves, where vertical speed costs next to nothing; here it costs what the gauge takes off.
+    # The gauge's metrics fall where the trunk bobs. Ground that is to be climbed needs vertical speed; here a robot does without.
     vertical_velocity=2.5,
     interval=3.0,
     reversal_probability=0.5,
@@ -131,8 +131,8 @@ _PRECISE = Stretch(
             "environment.randomization.motor_speed=1,5",
             "environment.rewards.joint_speed_limits=-0.15",
             "environment.randomization.friction=0.15,1.25",
-            # The tracking kernels are narrow, level ground pays more for them and less for a trunk that bobs and rocks, and the mean error
-            # of a turn on the spot costs most.
+            # The tracking kernels are narrow. Level ground pays more for tracking and prices a trunk that bobs and rocks. The mean error of
+            # a turn on the spot costs most.
             "environment.rewards.tracking_sigma=0.15",
             "environment.rewards.yaw_tracking=1.5",
             "environment.rewards.turn_error=-4",
