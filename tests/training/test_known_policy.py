@@ -32,7 +32,7 @@ def test_levels_have_the_last_stretch_and_the_commands_of_their_kind():
     played = FixedLevels("pretrained", kind="stairs_up", levels=(3,), worlds=1, speeds=None, settings=())
     tiles = played.environment.configuration.terrain.tiles
     assert [tile.name for tile in tiles if tile.share] == ["stairs_up"], "the stretch has shares of its own"
-    assert played.environment.configuration.rewards.turn_error == -4.0
+    assert played.environment.configuration.rewards.turn_error == -6.0
 
 
 def test_steps_of_another_depth_and_height():

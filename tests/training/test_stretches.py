@@ -119,7 +119,7 @@ def test_a_robot_of_unknown_motor_speeds_has_a_last_stretch_without_them():
     check_stretches(settings, whole, contract)
     last = settings_in(settings, 1)
     assert last.randomization.motor_speed == (1.0, 1.0) and last.rewards.joint_speed_limits == 0.0
-    assert last.rewards.turn_error == -4.0
+    assert last.rewards.turn_error == -6.0
     judged = Stretch(name="judged", begin=0.5, settings="environment.rewards.joint_speed_limits=-1")
     asked = replace(settings, schedule=ScheduleConfiguration(stretches=(judged,)))
     with pytest.raises(ConfigurationError, match="does not say how fast its motors turn"):
@@ -169,7 +169,7 @@ def test_a_stretch_leaves_ground_alone_that_the_task_does_not_have():
     flat = replace(ground, tiles=tuple(tile for tile in ground.tiles if tile.name == "flat"))
     found = settings_in(replace(task.environment, terrain=flat), 1)
     assert [tile.name for tile in found.terrain.tiles] == ["flat"]
-    assert found.rewards.turn_error == -4.0 and found.terrain.tiles[0].share == 0.18
+    assert found.rewards.turn_error == -6.0 and found.terrain.tiles[0].share == 0.18
 
 
 def test_stretches_follow_in_order():
