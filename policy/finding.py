@@ -14,6 +14,7 @@ PRETRAINED = SHIPPED / "go2.gauge.pt"
 OF_RUNS = ("latest", "best")
 """Names of checkpoints of the last training run."""
 _ENDING = ".gauge.pt"
+_RANK_FILE = re.compile(r"(.+)\.rank\d+\.pt")
 
 
 def shipped_policies() -> dict[str, Path]:
@@ -64,6 +65,8 @@ def find_policy(path_or_name: str | Path) -> Path:
         raise PolicyError(f"there is no policy file '{name}'; give the path of a file, or one of: {', '.join(names)}")
     if not path.is_file():
         raise PolicyError(f"'{name}' is not a regular file")
+    if (part := _RANK_FILE.fullmatch(path.name)) and (whole := path.with_name(f"{part[1]}.pt")).is_file():
+        raise PolicyError(f"'{name}' is what one process of a training on several GPUs adds to its checkpoint; give '{whole}'")
     return path
 
 

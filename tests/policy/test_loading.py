@@ -77,6 +77,15 @@ def test_missing_and_unsuitable_paths(tmp_path):
     assert "latest" in refused("lastest")
 
 
+def test_the_part_of_one_process_names_the_checkpoint(tmp_path):
+    whole, part = tmp_path / "model_40.pt", tmp_path / "model_40.rank1.pt"
+    part.write_bytes(b"")
+    assert find_policy(part) == part, "without the checkpoint beside it the name says nothing"
+    whole.write_bytes(b"")
+    with pytest.raises(PolicyError, match=f"several GPUs adds to its checkpoint; give '{whole}'"):
+        find_policy(part)
+
+
 @pytest.mark.parametrize(
     "content",
     [
