@@ -59,22 +59,25 @@ def run(name: str, *words: str) -> str:
     return shown.read_text(encoding="utf-8")
 
 
-def save(image: Image.Image, name: str) -> None:
-    """Write a picture with as many colours as fit into ``LARGEST``."""
-    for colours in (256, 128, 64, 32):
+def save(image: Image.Image, name: str, most: int = 256) -> None:
+    """Write a picture with as many colours as fit into ``LARGEST``, at most ``most``."""
+    for colours in (n for n in (256, 128, 64, 32) if n <= most):
         image.convert("RGB").quantize(colours, dither=Image.Dither.NONE).save(MEDIA / name, optimize=True)
         if (MEDIA / name).stat().st_size <= LARGEST:
             break
     print(f"{name}: {image.width} x {image.height}, {(MEDIA / name).stat().st_size / 1000:.0f} kB, {colours} colours")
 
 
-def shoot(address: str, file: str, *, width: int = 1150, height: int = 900, at: str = "", wait: float = 1.0) -> None:
+def shoot(
+    address: str, file: str, *, width: int = 1150, height: int = 900, at: str = "", wait: float = 1.0, most: int = 256
+) -> None:
     """Write a picture of a page's top, or of a part of it, about 1,300 pixels wide.
 
     Args:
         width, height: of the window, and at most of the picture [CSS pixels].
         at: the heading of a section, or a CSS selector.
         wait: for what moves or loads [s].
+        most: colours.
     """
     program = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))))
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
@@ -109,7 +112,7 @@ def shoot(address: str, file: str, *, width: int = 1150, height: int = 900, at: 
             data = call("Page.captureScreenshot", clip=clip, captureBeyondViewport=True)["data"]
         chromium.terminate()
         chromium.wait()
-    save(Image.open(BytesIO(base64.b64decode(data))), file)
+    save(Image.open(BytesIO(base64.b64decode(data))), file, most)
 
 
 def terminal(file: str, command: str, text: str) -> None:
@@ -168,7 +171,11 @@ def evaluation() -> None:
 
 def studies() -> None:
     """Shoot the pages of a comparison, a board, field trials, a look into the latent and a study of engines."""
-    a, b = str(CARDS / "shipped-on-2026-11-28-gaitgauge-1.json.gz"), str(CARDS / "cts-gaitgauge-1.json.gz")
+    WORK.mkdir(parents=True, exist_ok=True)
+    if not (WORK / "docs").exists():
+        (WORK / "docs").symlink_to(ROOT / "docs")  # pages show the cards' paths as a reader types them
+    cards = str(CARDS.relative_to(ROOT))
+    a, b = f"{cards}/pretrained-gaitgauge-1.json.gz", f"{cards}/cts-gaitgauge-1.json.gz"
     engines = (
         "--backends",
         "mujoco,mujoco@foot_condim=3",
@@ -181,14 +188,14 @@ def studies() -> None:
     )
     for file, name, page, words in (
         ("comparison", "compare", "compare/comparison.html", ("compare", a, b)),
-        ("board", "board", "board.html", ("board", str(CARDS))),
+        ("board", "board", "board.html", ("board", cards)),
         ("trials", "trials", "trials/trial.html", ("trial", "pretrained")),
         ("latent", "latent", "latent/latent.html", ("latent", "pretrained", "--robots", "2")),
         ("consistency", "consistency", "consistency/consistency.html", ("consistency", "pretrained", *engines)),
         ("jury", "jury", "jury/jury.html", ("jury", "pretrained")),
     ):
         run(name, *words, "--out", "board.html" if name == "board" else name)
-        shoot((WORK / page).as_uri(), f"{file}.png")
+        shoot((WORK / page).as_uri(), f"{file}.png", most=64)
 
 
 PARTS = {f.__name__: f for f in (terminals, evaluation, studies, viewer)}
