@@ -59,25 +59,24 @@ def run(name: str, *words: str) -> str:
     return shown.read_text(encoding="utf-8")
 
 
-def save(image: Image.Image, name: str, most: int = 256) -> None:
-    """Write a picture with as many colours as fit into ``LARGEST``, at most ``most``."""
-    for colours in (n for n in (256, 128, 64, 32) if n <= most):
-        image.convert("RGB").quantize(colours, dither=Image.Dither.NONE).save(MEDIA / name, optimize=True)
+def save(image: Image.Image, name: str) -> None:
+    """Write a picture with as many colours as fit into ``LARGEST``; the octree keeps those of a few dots apart."""
+    for colours in (256, 128, 64, 32):
+        image.convert("RGB").quantize(colours, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE).save(
+            MEDIA / name, optimize=True
+        )
         if (MEDIA / name).stat().st_size <= LARGEST:
             break
     print(f"{name}: {image.width} x {image.height}, {(MEDIA / name).stat().st_size / 1000:.0f} kB, {colours} colours")
 
 
-def shoot(
-    address: str, file: str, *, width: int = 1150, height: int = 900, at: str = "", wait: float = 1.0, most: int = 256
-) -> None:
+def shoot(address: str, file: str, *, width: int = 1150, height: int = 900, at: str = "", wait: float = 1.0) -> None:
     """Write a picture of a page's top, or of a part of it, about 1,300 pixels wide.
 
     Args:
         width, height: of the window, and at most of the picture [CSS pixels].
         at: the heading of a section, or a CSS selector.
         wait: for what moves or loads [s].
-        most: colours.
     """
     program = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))))
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
@@ -112,7 +111,7 @@ def shoot(
             data = call("Page.captureScreenshot", clip=clip, captureBeyondViewport=True)["data"]
         chromium.terminate()
         chromium.wait()
-    save(Image.open(BytesIO(base64.b64decode(data))), file, most)
+    save(Image.open(BytesIO(base64.b64decode(data))), file)
 
 
 def terminal(file: str, command: str, text: str) -> None:
@@ -195,7 +194,7 @@ def studies() -> None:
         ("jury", "jury", "jury/jury.html", ("jury", "pretrained")),
     ):
         run(name, *words, "--out", "board.html" if name == "board" else name)
-        shoot((WORK / page).as_uri(), f"{file}.png", most=64)
+        shoot((WORK / page).as_uri(), f"{file}.png")
 
 
 PARTS = {f.__name__: f for f in (terminals, evaluation, studies, viewer)}
