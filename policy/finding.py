@@ -66,7 +66,9 @@ def find_policy(path_or_name: str | Path) -> Path:
     if not path.is_file():
         raise PolicyError(f"'{name}' is not a regular file")
     if (part := _RANK_FILE.fullmatch(path.name)) and (whole := path.with_name(f"{part[1]}.pt")).is_file():
-        raise PolicyError(f"'{name}' is what one process of a training on several GPUs adds to its checkpoint; give '{whole}'")
+        raise PolicyError(
+            f"'{name}' is what one process of a training on several GPUs adds to its checkpoint; give '{whole}'"
+        )
     return path
 
 
