@@ -37,10 +37,13 @@ class ProgressDisplay:
     _first: ClassVar[ProgressDisplay | None] = None
     """The display of a command that has not begun its work; the one of the work takes its place and its clock."""
 
-    def __init__(self, console: Terminal, title: str, *, clock: Callable[[], float] = time.monotonic) -> None:
-        """Prepare the display; ``clock`` gives the time [s]."""
+    def __init__(
+        self, console: Terminal, title: str, *, clock: Callable[[], float] = time.monotonic, began: float | None = None
+    ) -> None:
+        """Prepare the display; ``clock`` gives the time [s], ``began`` is its value where the shown time is 0, None for now."""
         self._console, self._title, self._clock = console, title, clock
-        self._began = self._told = self._updated = clock()
+        self._told = self._updated = clock()
+        self._began = self._told if began is None else began
         self._share, self._text = 0.0, "starting"
         self._left: float | None = None
         self.start = 0.0

@@ -68,7 +68,7 @@ def run_training(request: TrainRequest, time: str | None) -> None:
         console.say(f"run directory {run}")
         console.say("building the environment")
 
-    with ProgressDisplay(console, task) as display:
+    with ProgressDisplay(console, task, began=began) as display:
         watch = _Watch(display, None if seconds is None else began + seconds)
         outcome, run = train(plan, began=began, started=started, progress=watch.update, message=console.say)
     done = f"{outcome.iteration} iterations done"

@@ -117,6 +117,20 @@ def test_a_command_is_not_silent_while_it_imports_and_reads(monkeypatch):
     assert shown(show).splitlines() == [*lines, "0 s: another, 1 of 1"]
 
 
+def test_the_clock_may_begin_before_the_display(monkeypatch):
+    """A training that had imported for 19 s said 57 s of its first iteration, 75 s after the command."""
+    monkeypatch.setattr("gaitgauge.cli.progress._TICK", 10.0)
+    now = 19.0
+
+    def show(terminal):
+        nonlocal now
+        with ProgressDisplay(terminal, "training", clock=lambda: now, began=0.0) as display:
+            now = 75.0
+            display.update(0.5, "iteration 1 of 2", last=True)
+
+    assert shown(show).startswith("1 min 15 s: training, iteration 1 of 2")
+
+
 @pytest.mark.parametrize(("load", "again"), [(0.5, 3.0), (8.0, 6.0), (80.0, 20.0)])
 def test_another_start_finds_its_files_in_memory(monkeypatch, load, again):
     """The first one read packages for 20 s from a cold disk, of which 3 s were work; the end and the film were told too long."""
