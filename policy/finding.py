@@ -14,7 +14,7 @@ PRETRAINED = SHIPPED / "go2.gauge.pt"
 OF_RUNS = ("latest", "best")
 """Names of checkpoints of the last training run."""
 _ENDING = ".gauge.pt"
-_RANK_FILE = re.compile(r"(.+)\.rank\d+\.pt")
+_RANK_FILE = re.compile(r"(model_\d+)\.rank\d+\.pt")
 
 
 def shipped_policies() -> dict[str, Path]:
