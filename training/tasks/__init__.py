@@ -132,7 +132,7 @@ _PRECISE = Stretch(
             "environment.rewards.joint_speed_limits=-0.15",
             "environment.randomization.friction=0.15,1.25",
             # The tracking kernels are narrow. Level ground alone pays more for tracking: a robot that stands on stairs has all of the yaw
-            # rate's pay. It prices a trunk that bobs and rocks. The mean error of a turn on the spot costs most.
+            # rate's pay. Level ground prices a bobbing, rocking trunk too. The mean error of a turn on the spot costs most.
             "environment.rewards.tracking_sigma=0.15",
             "environment.rewards.turn_error=-6",
             "environment.rewards.turn_error_time=0.3",
