@@ -48,17 +48,19 @@ def run_training(request: TrainRequest, time: str | None) -> None:
     began = clock.monotonic()
     seconds = None if time is None else parse_duration(time)
     check_gpu(request)  # before torch is loaded
+    from ..training.processes import RUN_BEGAN
     from ..training.run.launch import train
     from ..training.run.plan import prepare
     from ..training.starting import processes_to_start, start_processes
 
     plan = prepare(replace(request, seconds=seconds))
     if (count := processes_to_start(request.gpus, request.device, plan.device)) > 1:
-        if code := start_processes(count, sys.argv[1:]):
+        if code := start_processes(count, sys.argv[1:], began=began):
             raise typer.Exit(code)
         return
     task = plan.request.task  # a ground and a robot have become a task
-    # Of several processes, one for each GPU, the first prints.
+    # Of several processes, one for each GPU, the first prints; all count from the start of the command that started them.
+    began = float(os.environ.get(RUN_BEGAN, began))
     console = Terminal(quiet=os.environ.get("RANK", "0") != "0", may_lose=True)
     steps = plan.task.training.run.steps_per_iteration * plan.task.environment.num_envs
 

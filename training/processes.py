@@ -21,6 +21,8 @@ from .configuration import ConfigurationError
 
 RUN_TOLD = "GAITGAUGE_RUN_TOLD"
 """Environment variable that names the file in which the first of several processes writes its run directory, for ``starting``."""
+RUN_BEGAN = "GAITGAUGE_RUN_BEGAN"
+"""Environment variable with the time, on this machine's ``time.monotonic()``, at which the command began that started the processes."""
 
 
 def told_number(name: str, default: int) -> int:

@@ -18,7 +18,7 @@ from torch.distributed.launcher.api import LaunchConfig, elastic_launch
 
 from ..policy.finding import latest_checkpoint
 from .configuration import ConfigurationError
-from .processes import RUN_TOLD
+from .processes import RUN_BEGAN, RUN_TOLD
 
 
 def processes_to_start(gpus: int | None, asked: str | None, device: str) -> int:
@@ -42,10 +42,11 @@ def processes_to_start(gpus: int | None, asked: str | None, device: str) -> int:
     return gpus or here
 
 
-def start_processes(count: int, arguments: Sequence[str]) -> int:
+def start_processes(count: int, arguments: Sequence[str], *, began: float) -> int:
     """Run this program in several processes that know of each other, and wait for their end.
 
     The first process writes to the terminal. What others printed is shown where they failed first or the first one was killed.
+    ``began`` is ``time.monotonic()`` of the command's start, from which all of them count.
 
     Returns:
         The exit code of the first process that failed, otherwise 0.
@@ -54,7 +55,7 @@ def start_processes(count: int, arguments: Sequence[str]) -> int:
     logging.getLogger("torch.distributed.elastic").setLevel(logging.CRITICAL)
     with tempfile.TemporaryDirectory() as folder:
         told = Path(folder) / "run"
-        os.environ[RUN_TOLD] = str(told)
+        os.environ |= {RUN_TOLD: str(told), RUN_BEGAN: repr(began)}
         logs = DefaultLogsSpecs(log_dir=folder, redirects=dict.fromkeys(range(1, count), Std.ALL))
         config = LaunchConfig(
             min_nodes=1,

@@ -294,7 +294,7 @@ def test_more_gpus_than_there_are(monkeypatch):
 def test_several_gpus_get_the_command_as_it_was_typed(run, monkeypatch):
     started = []
     monkeypatch.setattr("gaitgauge.training.starting.processes_to_start", lambda *_: 3)
-    monkeypatch.setattr("gaitgauge.training.starting.start_processes", lambda *given: started.append(given) or 5)
+    monkeypatch.setattr("gaitgauge.training.starting.start_processes", lambda *given, began: started.append(given) or 5)
     monkeypatch.setattr(sys, "argv", ["gaitgauge", "train", "go2-flat"])
     assert run("train", "go2-flat", *FAKE, *SMALL).exit_code == 5
     assert started == [(3, ["train", "go2-flat"])]

@@ -7,6 +7,7 @@ import socket
 import subprocess
 import sys
 import time
+from datetime import datetime
 from pathlib import Path
 
 import pytest
@@ -50,8 +51,12 @@ runner.processes.leave()
 """
 
 
-TWO = "import sys; from gaitgauge.training.starting import start_processes; sys.exit(start_processes(2, sys.argv[1:]))"
-"""Start a command as ``train`` does where there are two GPUs."""
+TWO = """
+import sys, time
+from gaitgauge.training.starting import start_processes
+sys.exit(start_processes(2, sys.argv[1:], began=time.monotonic() - 1000.0))
+"""
+"""Start a command as ``train`` does where there are two GPUs; it began 1000 s ago."""
 ONE_MACHINE = ("--standalone", "--nproc-per-node", "2")
 
 
@@ -83,6 +88,10 @@ def test_one_process_speaks_and_both_are_kept(tmp_path):
     assert process.returncode == 0, output
     assert output.count("run directory") == 1
     (run,) = (tmp_path / "logs" / "rsl_rl" / "go2_flat").iterdir()
+    assert "16 min" in output, "the shown time does not count from the command"
+    description = json.loads((run / "run.json").read_text())
+    began, started = (datetime.fromisoformat(description[key]) for key in ("began", "started"))
+    assert 1000.0 <= (started - began).total_seconds() < 1200.0
     assert len(list(run.glob("events.out.tfevents.*"))) == 1
     assert sorted(f.name for f in run.glob("model_*.pt")) == ["model_2.pt", "model_2.rank1.pt"]
     first, second = (torch.load(run / f"model_2{end}.pt", weights_only=True) for end in ("", ".rank1"))
