@@ -65,12 +65,12 @@ def run_training(request: TrainRequest, time: str | None) -> None:
     steps = plan.task.training.run.steps_per_iteration * plan.task.environment.num_envs
 
     def started(run: Path) -> None:
-        verb = f"resuming {plan.checkpoint}" if plan.checkpoint else f"training {task}"
+        verb = f"resuming {plan.checkpoint}" if plan.checkpoint else f"training {plan.task.shown}"
         console.say(f"{verb} on {plan.backend} ({plan.device}), {steps} steps an iteration")
         console.say(f"run directory {run}")
         console.say("building the environment")
 
-    with ProgressDisplay(console, task, began=began) as display:
+    with ProgressDisplay(console, plan.task.shown, began=began) as display:
         watch = _Watch(display, None if seconds is None else began + seconds)
         outcome, run = train(plan, began=began, started=started, progress=watch.update, message=console.say)
     done = f"{outcome.iteration} iterations done"

@@ -34,6 +34,13 @@ def test_ratios(heavy):
     assert found.torque == pytest.approx(2.0)
 
 
+@pytest.mark.parametrize(
+    ("robot", "shown"), [(None, "go2-dreamwaq"), ("go2", "go2-dreamwaq"), ("anymal_c", "go2-dreamwaq for anymal_c")]
+)
+def test_a_task_names_a_robot_that_is_not_its_own(robot, shown):
+    assert find_task("rough-dreamwaq", robot=robot).shown == shown
+
+
 def test_what_is_scaled(heavy):
     own, other = find_task("go2-moe-cts"), find_task("go2-moe-cts", robot=heavy)
     environment = other.environment

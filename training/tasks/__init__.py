@@ -85,6 +85,13 @@ class Task:
         environment, training = scaled(self.environment, self.training, source)
         return replace(self, environment=environment, training=training)
 
+    @property
+    def shown(self) -> str:
+        """Its name, and the robot's where that is another one than the task is named for."""
+        robot = load_robot(self.environment.robot, check=False).name
+        own = TASKS[self.name].environment.robot if self.name in TASKS else robot
+        return self.name if robot == own else f"{self.name} for {robot}"
+
     def with_horizon(self) -> Task:
         """Return the task with schedules spread over exactly the run's own iterations."""
         run = self.training.run
