@@ -33,7 +33,7 @@ from .coverage import coverage
 from .described import describe
 from .episodes import QUALITY
 from .fit import check_fit
-from .goals import TARGET, check_terrain, count_sub_commands
+from .goals import TARGET, check_goals, check_terrain, count_sub_commands
 from .motors import parameters_digest, suite_parameters, with_parameters
 from .pipelines import PIPELINES, Environment, check_friction, check_payload, make_environments
 from .plan import Plan, PlanRules, environment_result, plan
@@ -123,6 +123,7 @@ def prepare(request: Request) -> Prepared:
     environments = make_environments(
         suite, terrains=terrains, frictions=frictions or None, payloads=payloads or None, level=level
     )
+    check_goals(suite, searched=any(e.searched for e in environments), judged=request.pipeline != "level")
     for name, environment in {e.terrain: e for e in environments}.items():
         highest = suite.scoring.levels if environment.level is None else environment.level
         check_terrain(suite, make_terrain(name, int(highest)), searched=environment.searched)

@@ -121,6 +121,28 @@ def _velocity_commands(
     return tuple(found)
 
 
+def check_goals(suite: Suite, *, searched: bool, judged: bool) -> None:
+    """Check that a suite has the goals that a run needs.
+
+    Args:
+        suite: the suite.
+        searched: a highest level is searched, by walks to the target.
+        judged: quality is measured, by commanded velocities.
+
+    Raises:
+        SuiteError: it has none of a kind.
+    """
+    names = {goal.name for goal in suite.goals}
+    if searched and TARGET not in names:
+        raise SuiteError(
+            f"suite '{suite.name}' has no goal '{TARGET}', so it searches no level; choose another suite, or give 'evaluate' a --level"
+        )
+    if judged and not names - {TARGET}:
+        raise SuiteError(
+            f"suite '{suite.name}' has no goal but '{TARGET}', so it measures no quality; add a goal, or use --pipeline level"
+        )
+
+
 def check_terrain(suite: Suite, terrain: Terrain, *, searched: bool) -> None:
     """Check that a terrain, a plug-in's for example, has what the goals need.
 

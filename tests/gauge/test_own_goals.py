@@ -5,7 +5,7 @@ import json
 
 import pytest
 import torch
-from gaitgauge.gauge.evaluate import Request, evaluate
+from gaitgauge.gauge.evaluate import Request, evaluate, prepare
 from gaitgauge.gauge.goals import Schedule, command_name
 from gaitgauge.gauge.suite import SuiteError, load_suite
 
@@ -93,3 +93,21 @@ def test_a_suite_with_goals_of_its_own_is_played_and_scored(suite_file, tmp_path
 def test_goals_that_cannot_be_played_are_refused(suite_file, old, new, sentence):
     with pytest.raises(SuiteError, match=sentence):
         load_suite(suite_file(SLALOM.replace(old, new)))
+
+
+@pytest.mark.parametrize(
+    ("text", "pipeline", "terrains", "sentence"),
+    [
+        (
+            SLALOM.replace('name = "target_pos_velocity"', 'name = "max_velocity"\nphases = [1.0, 1.0]'),
+            "stress",
+            ("wave",),
+            "no level",
+        ),
+        (SLALOM[: SLALOM.index("[[goals]]")] + SLALOM[SLALOM.rindex("[[goals]]") :], "stress", ("flat",), "no quality"),
+    ],
+)
+def test_a_suite_without_a_goal_that_the_run_needs_is_refused(suite_file, text, pipeline, terrains, sentence):
+    request = Request(policy="pretrained", suite=suite_file(text), pipeline=pipeline, terrains=terrains)
+    with pytest.raises(SuiteError, match=f"so it (searches|measures) {sentence}"):
+        prepare(request)

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from ...files.parsing import build, shown
+from ...gauge.goals import check_goals
 from ...gauge.suite import load_suite
 from ...policy.contract import PolicyContract
 from ...policy.finding import find_policy, latest_checkpoint, shipped_policies
@@ -152,7 +153,8 @@ def _checked_plan(request: TrainRequest, task: Task, backend: str) -> TrainPlan:
     if request.capture and not device.startswith("cuda"):
         raise ConfigurationError(f"--capture replays CUDA graphs and the device is '{device}'; leave it out")
     if request.score:
-        load_suite(request.score_suite or task.suite)
+        suite = load_suite(request.score_suite or task.suite)
+        check_goals(suite, searched=any(name != "flat" for name in suite.matrix.terrains), judged=True)
     settings = {"backend": backend, "environment": to_plain(task.environment), "training": to_plain(task.training)}
     known = find_task(request.task)
     foreign = foreign_functions(settings, to_plain([known.environment, known.training]))
