@@ -370,6 +370,7 @@ def test_time_limit_waits_for_no_score_unless_asked():
     assert wait(seconds=None) > 0.0
     assert wait(seconds=60.0) == 0.0
     assert wait("training.run.gauge_wait=30", seconds=60.0) == 30.0
+    assert wait("training.run.gauge_wait = 30", seconds=60.0) == 30.0
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ import pytest
 from gaitgauge.backends.base import DeviceError
 from gaitgauge.backends.gpu import gpu_count
 from gaitgauge.training.run import without_gpu
+from gaitgauge.training.run.plan import prepare
 from gaitgauge.training.run.request import TrainRequest
 from gaitgauge.training.tasks import TaskError
 
@@ -34,6 +35,20 @@ def test_each_part_of_the_refusal():
     assert "'gaitgauge train toy' learns to walk here in about" in said
     assert "the repository's docs/start/first_training.ipynb trains go2-flat on a hosted GPU" in said
     assert said.endswith("--backend mujoco trains this task here in about 14 h")  # 380 x 24 x 8192 / 1450 s
+
+
+@pytest.mark.usefixtures("bare")
+@pytest.mark.parametrize(
+    ("choices", "task"),
+    [
+        ({"task": "walk-dreamwaq", "robot": "g1"}, "g1-walk-dreamwaq"),
+        ({"task": "rough", "robot": "g1"}, "g1-rough"),
+        ({"task": "rough", "overrides": ("environment.robot=g1",)}, "g1-rough"),
+    ],
+)
+def test_a_ground_has_the_task_of_the_robot_asked_for(choices, task):
+    assert refusal(**choices).startswith(f"task '{task}' trains on")
+    assert prepare(TrainRequest(**choices, backend="fake", device="cpu")).task.name == task
 
 
 @pytest.mark.usefixtures("bare")

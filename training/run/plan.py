@@ -24,14 +24,14 @@ from ..configuration import ConfigurationError, RunConfiguration, TrainingConfig
 from ..environment.configuration import EnvironmentConfiguration
 from ..environment.own_terms import foreign_functions, policy_observations
 from ..processes import own_device
-from ..tasks import TASKS, Task, find_task, settled_name
+from ..tasks import TASKS, Task, find_task, named_robot, settled_name
 from .checkpoint import CheckpointError, reached, read_checkpoint, run_numbers
 from .logger import check_logger
 from .request import TrainRequest
 from .resuming import check_environments, check_network
 from .run_directory import find_checkpoint, read_run_json, refuse_links
 
-_GAUGE_WAIT = "training.run.gauge_wait="
+_GAUGE_WAIT = "training.run.gauge_wait"
 _SMALL_STEPS = (
     "training.algorithm.learning_rate=0.0003",
     "training.algorithm.student_learning_rate=0.0003",
@@ -86,7 +86,8 @@ def prepare(request: TrainRequest) -> TrainPlan:
         raise ConfigurationError(
             f"--fit fits a new run into --time, and {lacks}; {'leave --fit out' if request.resume else 'add --time'}"
         )
-    request = replace(request, task=settled_name(request.task, request.robot))
+    robot = request.robot or named_robot(request.own_overrides())
+    request = replace(request, task=settled_name(request.task, robot))
     if request.resume is not None:
         return resumed_run(request, request.resume)
     if request.init_from is not None:
@@ -178,7 +179,7 @@ def _named_task(request: TrainRequest, first: Iterable[str] = ()) -> Task:
 
 def _of_this_command(request: TrainRequest, run: RunConfiguration) -> RunConfiguration:
     """Return the run's settings with those changed that belong to this command alone and are not kept."""
-    if request.seconds is not None and not any(o.startswith(_GAUGE_WAIT) for o in request.own_overrides()):
+    if request.seconds is not None and _GAUGE_WAIT not in {o.split("=", 1)[0].strip() for o in request.own_overrides()}:
         run = replace(run, gauge_wait=0.0)  # the limit holds for the whole command
     if not request.score:
         return replace(run, gauge_interval=0)

@@ -24,7 +24,7 @@ def check_gpu(request: TrainRequest) -> None:
     """
     if (request.resume, request.init_from, request.device) != (None, None, None):
         return  # a checkpoint is read first
-    task = find_task(request.task, request.own_overrides())
+    task = find_task(request.task, request.own_overrides(), robot=request.robot)
     backend = request.backend or task.backend
     if not made_for_gpu(backend) or gpu_count() > 0:
         return

@@ -404,6 +404,17 @@ GROUNDS: Mapping[str, Mapping[str, str]] = MappingProxyType(
 robot's body plan chooses the task."""
 
 
+def named_robot(overrides: Iterable[str]) -> str | None:
+    """Return the robot that ``environment.robot=`` names, which is the same as ``--robot``; None where no override does."""
+    named = [o.split("=", 1)[1].strip() for o in overrides if _names_robot(o)]
+    return named[-1] if named else None
+
+
+def _names_robot(override: str) -> bool:
+    key, sign, _ = override.partition("=")
+    return bool(sign) and key.strip() == "environment.robot"
+
+
 def settled_name(name: str, robot: str | None = None) -> str:
     """Return the task of ``TASKS`` for a ground's name and a robot, None for the Go2; other names stay as they are.
 
@@ -458,11 +469,10 @@ def find_task(name: str, overrides: Iterable[str] = (), *, robot: str | None = N
         hint = f"did you mean {' or '.join(near)}? " if near else ""
         raise TaskError(f"unknown task '{one_line(name, 80)}'; {hint}the tasks are: {', '.join(names)}")
     chosen = list(overrides)
-    named = [o for o in chosen if o.split("=", 1)[0].strip() == "environment.robot"]
-    if named and robot is not None:
-        raise TaskError(f"the robot is given twice, as '{robot}' and with environment.robot=; leave one out")
-    if named:  # the same as --robot
-        robot, chosen = named[-1].split("=", 1)[1].strip(), [o for o in chosen if o not in named]
+    if (named := named_robot(chosen)) is not None:
+        if robot is not None:
+            raise TaskError(f"the robot is given twice, as '{robot}' and with environment.robot=; leave one out")
+        robot, chosen = named, [o for o in chosen if not _names_robot(o)]
     name = settled_name(name, robot)
     known = TASKS[name] if name in TASKS else _own_task(name)
     if robot is not None:
@@ -472,4 +482,4 @@ def find_task(name: str, overrides: Iterable[str] = (), *, robot: str | None = N
     return task if own_horizon else task.with_horizon()
 
 
-__all__ = ["GROUNDS", "TASKS", "Task", "TaskError", "find_task", "settled_name"]
+__all__ = ["GROUNDS", "TASKS", "Task", "TaskError", "find_task", "named_robot", "settled_name"]
