@@ -86,6 +86,10 @@ class HeightScan:
         else:
             self._fresh.logical_or_(episodes)
 
+    def by_name(self) -> dict[str, torch.Tensor]:
+        """Return the memory itself, not copies: past maps, oldest first [m], (N, steps, P), and who has none, (N,) bool."""
+        return {"past": self._past, "fresh": self._fresh}
+
     def __call__(self, state: PhysicsState) -> torch.Tensor:
         """Return the height of the base over each point [m], (N, P), and remember it; call once per control step."""
         position = state.base_position_w.to(torch.float32)

@@ -105,6 +105,11 @@ class ObservationBuilder:
             self.clocks.masked_fill_(episodes[:, None], 0.0)
             self._fresh.logical_or_(episodes)
 
+    def by_name(self) -> dict[str, torch.Tensor]:
+        """Return what terms of later frames take from earlier ones, beside the gait clocks; the tensors themselves, by name."""
+        found = {f"scan_{i}_{name}": kept for i, scan in self._scans.items() for name, kept in scan.by_name().items()}
+        return found if self._shown is None else found | {"shown": self._shown}
+
     def build(
         self,
         state: PhysicsState,

@@ -21,9 +21,9 @@ if TYPE_CHECKING:
 
 GROUP = "gaitgauge.observations"
 HEIGHT_SCAN = "height_scan"
+"""Height of the base over the ground at points of a grid about it, which turns with the heading."""
 ACTION_BEFORE_LAST = "action_before_last"
 """The builder remembers it: the ``last_action`` of the control step before."""
-"""Height of the base over the ground at points of a grid about it, which turns with the heading."""
 WITHOUT_WHEELS = "joint_pos_rel_without_wheel"
 """robot_lab's angles of joints, those of wheels being zero."""
 _WIDEST = 1000

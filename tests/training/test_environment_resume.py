@@ -6,6 +6,7 @@ from gaitgauge.training.configuration import ConfigurationError
 from gaitgauge.training.environment.configuration import (
     CommandConfiguration,
     CommandStage,
+    ObservationConfiguration,
     PushConfiguration,
     Ramp,
     ResetConfiguration,
@@ -32,8 +33,8 @@ BUSY = {
 }
 
 
-def busy(seed=0):
-    environment = make(12, seed=seed, script=FakeScript(), **BUSY)
+def busy(seed=0, policy=()):
+    environment = make(12, seed=seed, script=FakeScript(), observations=ObservationConfiguration(policy=policy), **BUSY)
     environment.episode_length_buf = torch.arange(12) % 20
     return environment
 
@@ -56,18 +57,28 @@ def same(left, right):
             assert torch.equal(a[name], b[name]), (step, name)
 
 
-def test_continuing_equals_never_having_stopped(tmp_path):
-    straight = busy()
+@pytest.mark.parametrize("policy", [(), ("height_scan", "action_before_last")])
+def test_continuing_equals_never_having_stopped(tmp_path, policy):
+    straight = busy(policy=policy)
     run(straight, 17, 1)
     torch.save(straight.state_dict(), tmp_path / "state.pt")
     expected = run(straight, 30, 2)
     assert sum(row["done"].sum() for row in expected) > 12
 
-    resumed = busy(seed=99)
+    resumed = busy(seed=99, policy=policy)
     run(resumed, 3, 5)
     resumed.load_state_dict(torch.load(tmp_path / "state.pt", weights_only=True))
     same(run(resumed, 30, 2), expected)
     assert resumed.common_step_counter == straight.common_step_counter == 47
+
+
+def test_a_run_from_before_past_maps_were_kept_goes_on():
+    environment = busy(policy=("height_scan",))
+    run(environment, 5, 1)
+    saved = environment.state_dict()
+    del saved["seen_before"]
+    environment.load_state_dict(saved)
+    run(environment, 1, 2)
 
 
 def test_observations_come_back():

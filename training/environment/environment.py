@@ -394,6 +394,7 @@ class TrainingEnvironment(VecEnv):
             "motors": copied(self.parts.motors.by_name()),
             "scenarios": {} if self.parts.scenarios is None else copied(self.parts.scenarios.by_name()),
             "bodies": copied(self._bodies),
+            "seen_before": copied(self.parts.seen_before()),
             "observations": copied(vars(self._observations)),
             "generator": self._generator.get_state(),
             "common_step_counter": self.common_step_counter,
@@ -435,6 +436,8 @@ class TrainingEnvironment(VecEnv):
         parts.motors.apply(self.backend)
         if parts.scenarios is not None:
             restore(state["scenarios"], parts.scenarios.by_name())
+        # a run from before these were kept goes on with what a new episode begins with
+        restore(parts.seen_before() | state.get("seen_before", {}), parts.seen_before())
         self._observations = Observations(**fitting(state["observations"], vars(self._observations))).clone()
         self._generator.set_state(state["generator"].cpu())
         self.common_step_counter = int(state["common_step_counter"])

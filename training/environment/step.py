@@ -177,6 +177,10 @@ class EnvironmentStep:
             generator,
         )
 
+    def seen_before(self) -> dict[str, torch.Tensor]:
+        """Return what the policy's later frames take from earlier ones, beside ``memory``; the tensors themselves, by name."""
+        return self._builder.by_name()
+
     def targets(self) -> torch.Tensor:
         """Return the joint targets of the present action [rad], (N, J)."""
         return self._builder.targets(self.action)
