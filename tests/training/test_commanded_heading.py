@@ -1,5 +1,7 @@
 """The heading that commands ask for: what progress and the commanded way are measured along."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from gaitgauge.terrains.height_scan import heading
@@ -11,7 +13,7 @@ from gaitgauge.training.environment.configuration import (
     TerminationConfiguration,
 )
 from gaitgauge_fake_engine import FakeScript
-from small_environment import gliding, idle, make
+from small_environment import FLAT, gliding, idle, make
 
 
 def commanded(environment, forward, yaw):
@@ -55,6 +57,23 @@ def test_a_new_command_sets_out_from_the_robot_s_own_heading():
     own = heading(environment.backend.state.base_quaternion_w).float()
     assert torch.allclose(memory.commanded_heading[:2], own[:2], atol=1e-5)
     assert torch.allclose(memory.commanded_heading[2:], ahead[2:])
+
+
+def test_the_way_back_to_a_heading_is_not_turned_round_with_the_command():
+    tile = replace(FLAT.tiles[0], reversal_probability=1.0)
+    environment = make(
+        64,
+        script=gliding(0.0, 0.0, 1.0),
+        terrain=replace(FLAT, tiles=(tile,)),
+        commands=CommandConfiguration(heading_gain=1.0),
+    )
+    memory, _ = commanded(environment, 0.5, 0.0)
+    idle(environment, 10)
+    assert (memory.command[:, 2] < -0.1).all(), "it leads back"
+    memory.command_steps.fill_(1)
+    idle(environment)
+    assert memory.command[:, 0].tolist() == pytest.approx([-0.5] * 64)
+    assert memory.command[:, 2].abs().max() < 1e-5 and not memory.holds_heading.all()
 
 
 def test_an_episode_sets_out_from_the_heading_of_its_start():

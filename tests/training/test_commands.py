@@ -46,6 +46,7 @@ def draw(configuration, *, progress=0.0, kind=0, count=COUNT, tiles=TILES, **cha
         "issued": torch.zeros(count, 2),
         "command": torch.zeros(count, 3),
         "extreme": torch.zeros(count, dtype=torch.bool),
+        "holds_heading": torch.zeros(count, dtype=torch.bool),
     }
     uniform = {name: torch.rand(count, width, generator=random) for name, width in COMMAND_COLUMNS.items()}
     return generator.draw(uniform, **{**state, **changes})

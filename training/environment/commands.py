@@ -179,6 +179,7 @@ class CommandGenerator:
         issued: torch.Tensor,
         command: torch.Tensor,
         extreme: torch.Tensor,
+        holds_heading: torch.Tensor,
     ) -> CommandDraw:
         """Draw one command per world.
 
@@ -190,6 +191,7 @@ class CommandGenerator:
             issued: sum of all linear commands of this episode, (N, 2) [m/s].
             command: the present command, (N, 3).
             extreme: whether the present command is an extreme one, (N,) bool; False at the start of an episode.
+            holds_heading: whether its yaw rate only leads back to a heading, (N,) bool.
         """
         settings, ranges = self._configuration, self.ranges(kind, progress)
         low, high = ranges.low, ranges.high
@@ -222,7 +224,7 @@ class CommandGenerator:
         drawn = torch.where(is_extreme[:, None], extremes, torch.cat((linear, yaw), dim=1))
         drawn = torch.where(is_opposite[:, None], opposite, drawn)
         steps = torch.where(is_stationary, stationary_steps, ranges.interval_steps).long()
-        holds_heading = straight & ~is_stationary & ~is_extreme
+        holds = straight & ~is_stationary & ~is_extreme
 
         # Crossing: straight on or back for the whole episode, on ground that has an edge to come to.
         if settings.crossing_probability > 0.0:
@@ -234,7 +236,7 @@ class CommandGenerator:
             straight_on[:, 0] = torch.clamp(torch.where(back, least, most) * (0.5 + 0.5 * speed), least, most)
             drawn = torch.where(crosses[:, None], straight_on, drawn)
             steps = torch.where(crosses, remaining, steps)
-            is_extreme, holds_heading = is_extreme & ~crosses, holds_heading | crosses
+            is_extreme, holds = is_extreme & ~crosses, holds | crosses
 
         # Reversal: back at once. Crossings are drawn at the start of an episode alone, so their numbers are free later.
         if self._reverses:
@@ -243,12 +245,14 @@ class CommandGenerator:
             moves, walks = squares.sum(dim=1) > _MOVES, squares[:, :2].sum(dim=1) > _MOVES
             reverses = (episode_length > 0) & (chance < ranges.reversal) & moves
             back = (straight_back < 0.5) & walks
-            reversed_ = torch.cat((opposite[:, :2], opposite[:, 2:].masked_fill(back[:, None], 0.0)), dim=1)
+            reversed_ = torch.cat(
+                (opposite[:, :2], opposite[:, 2:].masked_fill((back | holds_heading)[:, None], 0.0)), dim=1
+            )
             drawn = torch.where(reverses[:, None], reversed_, drawn)
             steps = torch.where(reverses, ranges.interval_steps.long(), steps)
             is_extreme = torch.where(reverses, extreme, is_extreme)
-            holds_heading = torch.where(reverses, back, holds_heading)
-        return CommandDraw(command=drawn, steps=steps, extreme=is_extreme, holds_heading=holds_heading)
+            holds = torch.where(reverses, back, holds)
+        return CommandDraw(command=drawn, steps=steps, extreme=is_extreme, holds_heading=holds)
 
     def held_yaw_rate(self, off: torch.Tensor, *, kind: torch.Tensor, progress: torch.Tensor) -> torch.Tensor:
         """Return yaw rates that lead back to the commanded heading [rad/s], (N,), from its angle to the robot's own [rad], (N,), the kind

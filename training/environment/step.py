@@ -257,6 +257,7 @@ class EnvironmentStep:
             issued=memory.issued,
             command=memory.command,
             extreme=memory.command_extreme,
+            holds_heading=memory.holds_heading,
         )
         torch.where(due[:, None], drawn.command, memory.command, out=memory.command)
         torch.where(due, drawn.steps, memory.command_steps, out=memory.command_steps)
