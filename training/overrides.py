@@ -1,6 +1,6 @@
 """``key=value`` settings on nested frozen dataclasses, converted to the type of the field they change.
 
-A key is a path of field names separated by dots. An element of a tuple is addressed by its number or, if it has a ``name``, by that:
+A key is a path of field names separated by dots. An element of a tuple is addressed by its ``name``, one without by its number:
 ``terrain.tiles.stairs_up.share=0.3``. Values: numbers, ``true``/``false``, ``none`` where a field may be None, text, and tuples as
 numbers separated by commas.
 """
@@ -69,12 +69,9 @@ def _set(node: Any, path: list[str], text: str, key: str, root: Any) -> Any:
         )
     elements = list(node)
     names = [child for child, _ in _children(node)]
-    if name in names:
-        place = names.index(name)
-    elif name in map(str, range(len(elements))):
-        place = int(name)
-    else:
+    if name not in names:
         raise _unknown(key, root)
+    place = names.index(name)
     if not rest:
         raise _group(key, elements[place])
     elements[place] = _set(elements[place], rest, text, key, root)
