@@ -31,7 +31,7 @@ def run(tmp_path, monkeypatch):
     """A run directory with two films of the last checkpoint and one of an earlier one."""
     (tmp_path / "run.json").write_text(json.dumps(RUN))
     (tmp_path / "videos").mkdir()
-    for name in ("model_5_flat", "model_20_flat", "model_20_stairs_fd"):
+    for name in ("model_5_flat", "model_20_flat", "model_20_stairs_fd", "film", "model_best_flat"):
         (tmp_path / "videos" / f"{name}.mp4").write_bytes(name.encode())
     points = {"mean reward": ([0.0, 1.0], [-2.0, 8.0]), "mean terrain level in training": ([0.0, 1.0], [0.0, 0.0])}
     monkeypatch.setattr(page, "logged_curves", lambda folder: points)

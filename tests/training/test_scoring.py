@@ -70,6 +70,15 @@ def test_the_oldest_waiting_job_is_given_up_and_a_running_one_can_be_stopped(tmp
     assert time.monotonic() - start < 5.0 and side.pending == 0
 
 
+def test_jobs_of_one_checkpoint_wait_together(tmp_path):
+    side = SideProcess()
+    for number in (0, 0, 1, 1, 2, 2):
+        side.submit(python(tmp_path, number, "import time; time.sleep(60)"))
+    assert [(f.job.iteration, f.failure) for f in side.poll()] == [(n, "skipped") for n in (0, 1, 1)]
+    assert side.pending == 3
+    side.close()
+
+
 @pytest.mark.slow
 def test_a_gauge_that_cannot_play_says_why(tmp_path):
     """The gauge itself runs; the checkpoint is none."""

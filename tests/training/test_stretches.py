@@ -6,6 +6,7 @@ from unittest.mock import patch
 
 import pytest
 import torch
+import yaml
 from gaitgauge.robots import load_robot
 from gaitgauge.training.configuration import ConfigurationError
 from gaitgauge.training.environment import environment as environment_module
@@ -290,6 +291,10 @@ def test_a_run_fits_its_schedules_into_the_time(tmp_path, monkeypatch):
     assert outcome.iteration == 3 and outcome.reason == "finished"
     assert float(run.env.progress) == pytest.approx(1.0) and run.env.stretch == 1
     assert any(text.startswith("3 iterations of 4 fit into the time, ") for text in messages)
+    agent, env = (
+        yaml.safe_load((tmp_path / "run" / "params" / f"{name}.yaml").read_text()) for name in ("agent", "env")
+    )
+    assert agent["run"]["iterations"] == 3 and env["schedule"]["horizon_steps"] == 18
     stored = read_checkpoint(tmp_path / "run" / "model_3.pt")["training"]["settings"]
     assert stored == {"training": {"run": {"iterations": 3}}, "environment": {"schedule": {"horizon_steps": 18}}}
 

@@ -74,7 +74,7 @@ class Filmer:
                 job.log.unlink(missing_ok=True)
             elif finished.failure == "skipped":
                 sentence = (
-                    f"No video of iteration {job.iteration}: filming is slower than training; raise --video-every."
+                    f"No {job.output.with_suffix('.mp4').name}: filming is slower than training; raise --video-every."
                 )
             else:
                 said = job.log.read_text(errors="replace").strip().splitlines() if job.log.is_file() else []

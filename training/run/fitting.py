@@ -5,9 +5,10 @@ from __future__ import annotations
 import copy
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
-from .run_directory import update_run_json
+from .run_directory import update_run_json, write_parameters
 from .state import RunState
 
 SKIPPED, MEASURED = 10, 20
@@ -89,3 +90,5 @@ class Fit:
         run.settings["environment"]["schedule"]["horizon_steps"] = steps
         if run.log_dir is not None and run.processes.rank == 0:
             update_run_json(run.log_dir, {"settings": run.settings})
+            agent = replace(run.configuration, run=replace(run.configuration.run, iterations=iterations))
+            write_parameters(run.log_dir, environment=run.settings["environment"], agent=agent)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from .scoring import GAUGE_FOLDER
 
 PAGE = "training.html"
 _ENDS = "Episode_Termination/"
+_FILM = re.compile(r"model_(?P<iteration>\d{1,12})_(?P<terrain>.+)")
 
 
 def write_page(run: Path, *, scores: str | None, scalars: Mapping[str, float]) -> Path:
@@ -42,8 +44,8 @@ def _render(run: Path, scores: str | None, scalars: Mapping[str, float]) -> str:
     curves = logged_curves(run)
     folder = None if scores is None else _last_score(run / GAUGE_FOLDER)
     result = None if folder is None else read_result(folder / "results.json", CheckpointError)
-    films = sorted((run / VIDEO_FOLDER).glob("*.mp4"), key=lambda film: int(film.stem.split("_")[1]))
-    last = [film for film in films if film.stem.split("_")[1] == films[-1].stem.split("_")[1]]
+    films = {film: _FILM.fullmatch(film.stem) for film in sorted((run / VIDEO_FOLDER).glob("*.mp4"))}
+    shown = [(int(name["iteration"]), name["terrain"], film) for film, name in films.items() if name]
     described = read_run_json(run)
     schedule = described.get("settings", {}).get("environment", {}).get("schedule", {})
     return page_template(__file__, "training.html.j2", terrain=charts.terrain_label).render(
@@ -55,7 +57,11 @@ def _render(run: Path, scores: str | None, scalars: Mapping[str, float]) -> str:
         report=None if folder is None else f"{folder.relative_to(run).as_posix()}/report.html",
         rows=[] if result is None else [_row(row) for row in result.environments],
         ends={key.removeprefix(_ENDS): value for key, value in scalars.items() if key.startswith(_ENDS)},
-        films=[(film.stem.split("_", 2)[2], base64.b64encode(film.read_bytes()).decode()) for film in last],
+        films=[
+            (terrain, base64.b64encode(film.read_bytes()).decode())
+            for iteration, terrain, film in shown
+            if iteration == max(shown)[0]
+        ],
     )
 
 

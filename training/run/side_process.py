@@ -49,7 +49,7 @@ class Finished:
 
 
 class SideProcess:
-    """Runs jobs in the order of their submission; of those that wait, all but the last are given up."""
+    """Runs jobs in the order of their submission; of those that wait, all but the last checkpoint's are given up."""
 
     def __init__(self) -> None:
         self._waiting: deque[Job] = deque()
@@ -58,9 +58,9 @@ class SideProcess:
 
     def submit(self, job: Job) -> None:
         """Run a job when its turn comes."""
-        self._waiting.append(job)
-        if len(self._waiting) > 1:
+        while self._waiting and self._waiting[0].checkpoint != job.checkpoint:
             self._finished.append(Finished(job=self._waiting.popleft(), failure="skipped"))
+        self._waiting.append(job)
         self._start_next()
 
     def poll(self) -> list[Finished]:
