@@ -46,15 +46,15 @@ def _positive(owner: object, *names: str) -> None:
             raise ConfigurationError(f"{name} is {value}; it must be greater than zero.")
 
 
-def check_rising(configuration: object, *names: str) -> None:
-    """Refuse ranges that end below their beginning.
+def check_rising(configuration: object, *names: str, strictly: bool = False) -> None:
+    """Refuse ranges that end below their beginning, or, ``strictly``, at it.
 
     Raises:
         ValueError: one sentence.
     """
     for name in names:
         low, high = getattr(configuration, name)
-        if low > high:
+        if low > high or (strictly and low == high):
             raise ValueError(f"{name} is {low:g} to {high:g}; it must rise")
 
 

@@ -143,8 +143,7 @@ def make_case(name: str, values: Mapping[str, float], factors: Iterable[str]) ->
     """Return a case with some factors; values of others become nominal."""
     has = frozenset(factors)
     exact = (
-        round(values[p.name]) if p.whole else round(values[p.name], _DIGITS) if p.factor in has else p.nominal
-        for p in PARAMETERS
+        p.nominal if p.factor not in has else round(values[p.name], None if p.whole else _DIGITS) for p in PARAMETERS
     )
     return Case(name, tuple(float(v) for v in exact), has)
 

@@ -212,6 +212,11 @@ def test_what_a_fall_does_not_need_is_taken_away():
     assert reduction.elite.case.named["payload"] == 0.0
 
 
+def test_values_of_factors_that_a_case_lacks_are_nominal():
+    case = make_case("one", NOMINAL | {"step_count": 4.0, "friction": 0.2}, ("latency",))
+    assert (case.named["step_count"], case.named["friction"]) == (NOMINAL["step_count"], NOMINAL["friction"])
+
+
 def test_distances_and_hardness_by_hand():
     slow = make_case("a", NOMINAL | {"friction": 0.2, "latency": 0.03}, ("friction", "latency"))
     late = make_case("b", NOMINAL | {"latency": 0.06}, ("latency",))

@@ -171,6 +171,15 @@ def test_episodes_spread_over_the_tile_do_not_move_levels():
     assert torch.equal(environment.parts.memory.level, level)
 
 
+def test_without_a_curriculum_every_episode_draws_its_level():
+    drawn = replace(STAIRS, spread_probability=1.0, tiles=STAIRS.tiles[:1], curriculum=False)
+    environment = make(64, script=gliding(8.0), terrain=drawn)
+    level = environment.parts.memory.level
+    level.fill_(1)
+    finished = sum(idle(environment)[2] for _ in range(60))
+    assert level[finished > 0].unique().tolist() == [0, 1, 2]
+
+
 def walking(speed_share, command):
     """A script in which each base has that share of the commanded speed, (N,), along the command."""
 

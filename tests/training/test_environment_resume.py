@@ -125,13 +125,14 @@ def test_progress_without_episodes(tmp_path):
     run(reached, 17, 1)
     level = torch.arange(12) % 3
     reached.parts.memory.level.copy_(level)
+    reached.parts.memory.diverged_total.fill_(7)
     torch.save(reached.progress_dict(), tmp_path / "progress.pt")
 
     resumed = busy(seed=99)
     run(resumed, 3, 5)
     resumed.load_state_dict(torch.load(tmp_path / "progress.pt", weights_only=True))
     memory = resumed.parts.memory
-    assert torch.equal(memory.level, level) and resumed.common_step_counter == 17
+    assert torch.equal(memory.level, level) and resumed.common_step_counter == 17 and int(memory.diverged_total) == 7
     assert torch.equal(resumed.parts.progress(), reached.parts.progress())
     assert int(memory.episode_length.abs().sum()) == 0 and torch.equal(memory.history[:, :-1], memory.history[:, 1:])
     kinds, variants = resumed.palette.index, memory.terrain_index

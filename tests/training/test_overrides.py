@@ -113,6 +113,7 @@ def test_mistakes_are_named(override, message):
         ("environment.commands.stages.0.forward=1,-1", r"forward is 1 to -1; it must rise"),
         ("environment.reset.joint_scale=2,1", r"joint_scale is 2 to 1; it must rise"),
         ("environment.rewards.sigma_linear_range=2,1", r"sigma_linear_range is 2 to 1; it must rise"),
+        ("environment.rewards.sigma_yaw_range=1,1", r"sigma_yaw_range is 1 to 1; it must rise"),
         ("environment.terrain.leave_distance=-1", r"'environment.terrain.leave_distance' is '-1'"),
         ("environment.reset.footprint=1e300,1", r"'environment.reset.footprint' is '1e300'"),
         ("environment.rewards.trunk_area=-1,1", r"'environment.rewards.trunk_area' is '-1'"),

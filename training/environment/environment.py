@@ -44,6 +44,8 @@ from .stretches import check_stretches, settings_in, stretch_at
 _log = logging.getLogger(__name__)
 
 STATE_VERSION = 1
+_PROGRESS = ("step", "level", "diverged_total")
+"""What of the memory a run keeps where its episodes begin anew."""
 _SEED_STRIDE = 1_000_003
 """Distance of the seeds of a run's stretches: those of its processes are neighbours."""
 
@@ -356,7 +358,7 @@ class TrainingEnvironment(VecEnv):
 
     def _enter(self, state: dict[str, Any]) -> bool:
         """Build the stretch that a saved state has reached; returns True if it begins there, which its episodes then have done."""
-        reached = {**state, **{k: v for k, v in state.get("memory", {}).items() if k in ("step", "level")}}
+        reached = {**state, **{k: v for k, v in state.get("memory", {}).items() if k in _PROGRESS}}
         stretch = stretch_at(self._given.schedule, int(reached["step"]))
         if stretch != self.stretch:
             self._rebuild(stretch)
@@ -367,14 +369,15 @@ class TrainingEnvironment(VecEnv):
     # --- resuming ---------------------------------------------------------------------------------------------------
 
     def progress_dict(self) -> dict[str, Any]:
-        """Return the progress of a run without its running episodes: step counter, levels, and the bodies that were drawn, since the
-        levels were found with them.
+        """Return the progress of a run without its running episodes: step counter, levels, the bodies that were drawn, since the levels
+        were found with them, and how many worlds have diverged.
         """
         return {
             "version": STATE_VERSION,
             "stretch": self.stretch,
             "step": self.parts.memory.step.clone(),
             "level": self.parts.memory.level.to(torch.int16),
+            "diverged_total": self.parts.memory.diverged_total.clone(),
             "bodies": copied(self._bodies),
             "common_step_counter": self.common_step_counter,
         }
@@ -468,9 +471,12 @@ class TrainingEnvironment(VecEnv):
                 f"{self.num_envs}"
             )
         memory = self.parts.memory
-        found = fitting(progress, {"level": memory.level, "step": memory.step})
+        # a run from before those that diverged were carried on begins to count
+        progress = {"diverged_total": memory.diverged_total, **progress}
+        found = fitting(progress, {name: getattr(memory, name) for name in _PROGRESS})
         self._require_below(found["level"], self.palette.num_levels, "level")
         memory.step.copy_(found["step"])
+        memory.diverged_total.copy_(found["diverged_total"])
         self.common_step_counter = int(progress["common_step_counter"])
         self._take_bodies(progress["bodies"])
         self._begin(found["level"])

@@ -73,7 +73,8 @@ class EpisodeStarts:
         for the curriculum.
         """
         spread = uniform["spread"][:, 0] < self._terrain.spread_probability
-        torch.where(worlds, ~spread, memory.moves_level, out=memory.moves_level)
+        counts = ~spread if self._terrain.curriculum else worlds
+        torch.where(worlds, counts, memory.moves_level, out=memory.moves_level)
         xy = uniform.signed("place") * torch.where(spread, self._spread, self._jitter)[:, None]
         yaw = uniform.between("yaw", -math.pi, math.pi)[:, 0]
         if self._scenarios is not None:

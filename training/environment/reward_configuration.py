@@ -177,7 +177,7 @@ class RewardShapes:
     """Ground that foot height is measured from: ``foot`` (below that foot) or ``base`` (mean below the trunk)."""
 
     def __post_init__(self) -> None:
-        check_rising(self, "sigma_linear_range", "sigma_yaw_range")
+        check_rising(self, "sigma_linear_range", "sigma_yaw_range", strictly=True)
 
 
 @dataclass(frozen=True, kw_only=True)

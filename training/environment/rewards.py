@@ -162,8 +162,9 @@ def roll(inputs: StepInputs) -> torch.Tensor:
 
 
 def torque_change(inputs: StepInputs) -> torch.Tensor:
-    """Sum of squared torque changes since the last control step [N²·m²]."""
-    return (inputs.joint_torque - inputs.previous_joint_torque).square().sum(dim=1)
+    """Sum of squared torque changes since the last control step [N²·m²]; 0 in the first of an episode, before which no torque is known."""
+    before = inputs.previous_joint_torque
+    return (inputs.joint_torque - before).square().sum(dim=1) * (before != 0).any(dim=1)
 
 
 def stand_still(inputs: StepInputs) -> torch.Tensor:

@@ -105,7 +105,7 @@ class TerrainConfiguration:
     spawn_jitter: _Spread = 1.0
     """Episodes start up to this far from the tile's middle, in x and in y [m]."""
     spread_probability: Share = 0.1
-    """Share of the episodes that start anywhere on the tile instead, as the gauge's evaluation does; they do not move levels."""
+    """Share of the episodes that start anywhere on the tile instead, as the gauge's evaluation does; no success of theirs moves a level."""
     spread_distance: _Spread = 3.0
     """Those episodes start up to this far from the tile's middle, in x and in y [m]."""
     level_rule: str = "gaitgauge.training.environment.curriculum:next_level"

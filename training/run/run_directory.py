@@ -68,10 +68,10 @@ def find_checkpoint(
         runs = [r for r in root.glob("*/*") if r.is_dir()]
         for run in sorted(runs, key=lambda r: r.name, reverse=True):
             # A run for another robot than the task's has an experiment of its own; a task made of another one has that one's.
-            mine = run.parent.name == experiment
-            if task:
-                mine = read_run_json(run).get("task", task if mine else None) == task
-            if mine and (found := latest_checkpoint(run)):
+            mine, found = run.parent.name == experiment, latest_checkpoint(run)
+            if task and found:
+                mine = _task_of(run, task if mine else None) == task
+            if mine and found:
                 return found
         raise CheckpointError(f"There is no checkpoint: no run in '{root / experiment}' has a model_<iteration>.pt.")
     path = Path(choice)
@@ -87,6 +87,16 @@ def find_checkpoint(
         known = ", ".join(["latest", *others, "a run directory"])
         raise CheckpointError(f"There is no checkpoint '{one_line(choice)}'; give {known} or a model_<iteration>.pt.")
     return path
+
+
+def _task_of(run: Path, otherwise: str | None) -> str | None:
+    """Return the task of a run, or something else where it does not say; None for a run of other experiments with a damaged file."""
+    try:
+        return read_run_json(run).get("task", otherwise)
+    except CheckpointError:
+        if otherwise is not None:
+            raise
+        return None
 
 
 def write_parameters(run: Path, *, environment: Any, agent: Any) -> None:

@@ -33,7 +33,7 @@ class SweepEntry:
     backend: Text | None = None
     """Physics engine; None for that of the sweep."""
     device: Literal["cpu", "cuda"] | None = None
-    """Physics engine; None for that of the sweep."""
+    """Where it trains; None for that of the sweep."""
     init_from: Text | None = None
     """Shipped policy or checkpoint with the first networks; None for that of the sweep."""
 
