@@ -110,7 +110,10 @@ def test_run_directories(tmp_path):
     assert find_checkpoint("latest", experiment="go2", task="run", root=tmp_path) == first / "model_1000.pt"
     assert find_checkpoint("latest", experiment="go2", task="own:TASK", root=tmp_path) == own / "model_4.pt"
     assert find_checkpoint("latest", experiment="go2", root=tmp_path) == own / "model_4.pt"
-    (other / "run.json").write_text('{"task": "wa')
+    damaged = tmp_path / "mine" / "2028-01-01_00-00-00"
+    damaged.mkdir()
+    (damaged / "model_3.pt").touch()
+    (damaged / "run.json").write_text('{"task": "wa')
     assert find_checkpoint("latest", experiment="go2", task="own:TASK", root=tmp_path) == own / "model_4.pt"
     (own / "run.json").write_text('{"task": "ow')
     with pytest.raises(CheckpointError, match=r"2027-01-02_00-00-00/run\.json' is not valid JSON"):
