@@ -94,13 +94,15 @@ def show_contract(request: ShowRequest) -> None:
 
 def contract_table(contract: PolicyContract) -> Table:
     """Return a policy contract as a table for people."""
+    from ..gauge.described import training_physics
+    from ..policy.contract import PHYSICS
     from ..policy.observation_table import HEIGHT_SCAN
     from ..policy.robot_of import REMEMBERED
 
     table = Table(show_header=False)
     table.add_column("field")
     table.add_column("value", overflow="fold")
-    history = contract.history
+    history, physics = contract.history, training_physics(contract)
     frames = f"{history.length} frames, {history.order}, starts with {history.start}"
     rows = {
         "robot": contract.robot,
@@ -124,7 +126,12 @@ def contract_table(contract: PolicyContract) -> Table:
         "action offset [rad]": None if contract.action_offset is None else _numbers(contract.action_offset),
         "observation width": str(contract.observation_width),
         "command limits": "forward {:g} m/s, sideways {:g} m/s, turning {:g} rad/s".format(*contract.command_limits),
-        "made from": ", ".join(f"{k} {v}" for k, v in contract.provenance.items() if k != REMEMBERED) or "unknown",
+        "made from": ", ".join(
+            f"{key} {value}" for key, value in contract.provenance.items() if key not in (REMEMBERED, PHYSICS)
+        )
+        or "unknown",
+        "trained in": ", ".join(dict.fromkeys(f"{each.engine} {each.version}" for each in physics.trained))
+        or physics.note,
         "contract hash": contract.hash,
     }
     for name, value in rows.items():

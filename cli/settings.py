@@ -14,7 +14,7 @@ from rich.text import Text
 
 from ..training.run.request import TrainRequest
 from ..training.tasks import find_task
-from .console import Terminal
+from .console import Terminal, shell_command
 
 _WIDTH = 80
 
@@ -32,8 +32,9 @@ def print_settings(request: TrainRequest) -> None:
         for line in textwrap.wrap(text, _WIDTH, initial_indent=" " * indent, subsequent_indent=" " * indent):
             console.say(Text(line, style))
 
-    say(f"{chosen.name}: {chosen.title}. Change a setting with KEY=VALUE, for example", 0)
-    say(f"gaitgauge train {chosen.name} training.run.iterations=3000", 0)
+    say(f"{chosen.shown}: {chosen.title}. Change a setting with KEY=VALUE, for example", 0)
+    robot = [] if request.robot is None else ["--robot", request.robot]
+    say(shell_command(["train", request.task, *robot, "training.run.iterations=3000"]), 0)
     for root, configuration in (("environment", chosen.environment), ("training", chosen.training)):
         for group, meaning, entries in _groups(root, configuration):
             console.say(Text(f"\n{group}", "bold"))

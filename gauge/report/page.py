@@ -9,6 +9,7 @@ from operator import attrgetter
 from pathlib import Path, PurePath
 from typing import Any
 
+from ...policy.contract import PHYSICS
 from ..coverage import notes, score_label, suite_label
 from ..episodes import QUALITY
 from ..metrics import metric_label
@@ -250,6 +251,8 @@ def sources(result: Result) -> dict[str, str]:
     if provenance.physics_steps and provenance.seconds >= 1.0:  # not wholly resumed
         entries["physics steps"] += f" ({_grouped(round(provenance.physics_steps / provenance.seconds))} a second)"
     for key, value in policy.provenance.items():
+        if key == PHYSICS:  # it has rows of its own
+            continue
         text = _in_words(value)
         entries[f"policy: {key}"] = text if len(text) <= _LONGEST else text[:_LONGEST] + "…"
     return entries

@@ -147,7 +147,7 @@ def _toml(value: Any) -> str:
 
 
 _TEMPLATE = """# How a policy is run on robot '{robot}'. Delete what is as it stands here: left-out fields are these values.
-# One number stands for all joints. SI units, radians. docs/guides/your-policy.md explains each field.
+# One number stands for all joints. SI units, radians. docs/reference/contract.md explains each field.
 
 robot = "{robot}"
 # Joints in the order in which the network sees and moves them.

@@ -52,7 +52,7 @@ def _scaled(value: float, quantity: str) -> str:
 
 
 def _number(value: float) -> str:
-    return f"{value:.3g}".replace("-", "−")
+    return f"{value:.4g}".replace("-", "−")
 
 
 def traces(log: Log, motions: Mapping[str, Motion], errors: Mapping[str, Mapping[str, Array]]) -> list[dict[str, Any]]:

@@ -39,7 +39,7 @@ def sentences(results: dict[str, Any]) -> list[str]:
             f"With the seeds that were played, {len(alone)} of {len(failures)} fall in {results['engine']} alone, not in {engines}."
         )
     else:
-        found.append("No other engine is installed here that could play them again.")
+        found.append("No other engine has played them again.")
     return found
 
 

@@ -81,7 +81,7 @@ def test_suites_with_one_quality_seed_show_no_interval(suite):
     assert {row.interval for row in result.terrains.values()} == {None}
     assert {row.interval for row in result.metrics.values()} == {None}
     words = Page(render(result)).text
-    assert "no interval: one seed" in words and "There are no intervals: one seed shows no spread." in words
+    assert "no interval: one seed" in words and "one seed shows no spread of quality." in words
     assert "Intervals say what" not in words
 
 

@@ -83,6 +83,10 @@ class Scores(Beside[Scorer]):
             if run.log_dir is not None:
                 update_run_json(run.log_dir, {"best_score": score, "best_iteration": report.iteration})
             run.message(f"Best gauge score so far: {score:.4f} at iteration {report.iteration}.")
+        elif math.isfinite(score):
+            run.message(
+                f"Gauge score {score:.4f} at iteration {report.iteration}, best {run.best_score:.4f} at iteration {run.best_iteration}."
+            )
 
 
 class Videos(Beside[Filmer]):
