@@ -288,6 +288,19 @@ def test_best_is_chosen_by_the_gauge(tmp_path, monkeypatch):
     assert (resumed.best_score, resumed.best_iteration) == (0.6, 2)
 
 
+@pytest.mark.parametrize("late", [False, True])
+def test_every_score_is_told_and_that_the_last_one_is_not_waited_for(tmp_path, monkeypatch, late):
+    scorer, said = SlowScorer({1: 0.6, 2: 0.4}), []
+    configuration = toy_configuration(run={"gauge_interval": 1, "gauge_wait": 0.0})
+    runner = make(tmp_path, scorer=scorer, configuration=configuration, message=said.append)
+    if late:
+        monkeypatch.setattr(scorer, "drain", lambda *_: [])
+    runner.learn(2)
+    told = [text.split(":")[0] for text in said if "score" in text]
+    scored = ["Best gauge score so far", "Gauge score 0.4000 at iteration 2, best 0.6000 at iteration 1."]
+    assert told == (["The last checkpoint has no score"] if late else scored)
+
+
 def test_resume_refuses_what_does_not_fit(tmp_path):
     make(tmp_path).learn(1)
     path = tmp_path / "model_1.pt"

@@ -269,6 +269,10 @@ class TrainingRunner(RunState):
             self.message(f"Waiting for the {' and the '.join(waiting)}.")
         self.scores.take(seconds, stop)
         self.videos.take(seconds, stop)
+        if self.scores.pending and not stop():
+            self.message(
+                "The last checkpoint has no score: no time is left for it; 'gaitgauge evaluate latest' gives one."
+            )
 
     def _snapshot(self, total: int, elapsed: float) -> Progress:
         interval, ahead = self.configuration.run.gauge_interval, total - self.iteration

@@ -87,7 +87,7 @@ class Task:
 
     @property
     def shown(self) -> str:
-        """Its name, and the robot's where that is another one than the task is named for."""
+        """Return its name, and the robot's where that is another one than the task is named for."""
         robot = load_robot(self.environment.robot, check=False).name
         own = TASKS[self.name].environment.robot if self.name in TASKS else robot
         return self.name if robot == own else f"{self.name} for {robot}"
