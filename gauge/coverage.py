@@ -42,7 +42,11 @@ def coverage(
     found = {e.key for e in environments}
     levels = sorted({e.level for e in environments if e.level})
     units = {"payloads": " kg"}
-    foreign = [f"{_AXES[at]} {_listed(e.foreign)}{units.get(at, '')}" for at, e in axes.items() if e.foreign]
+    foreign = [
+        f"{'further ' * (len(e.foreign) < len(e.played))}{_AXES[at]} {_listed(e.foreign)}{units.get(at, '')}"
+        for at, e in axes.items()
+        if e.foreign
+    ]
     if levels:
         foreign.append(f"level {_listed(levels)} given, not searched for")
     foreign += changes(suite)

@@ -61,11 +61,11 @@ def test_a_part_is_data_too():
     ("suite", "choices", "text"),
     [
         (REFERENCE, {"frictions": [9.0]}, "friction 9"),
-        (REFERENCE, {"terrains": ["wave"], "frictions": [9.0, 0.6]}, "friction 9, 1 of 7 terrains"),
+        (REFERENCE, {"terrains": ["wave"], "frictions": [9.0, 0.6]}, "further friction 9, 1 of 7 terrains"),
         (REFERENCE, {"seeds": [77]}, "seed 77"),
-        (REFERENCE, {"seeds": [0, 1, 2, 3]}, "seed 3"),
-        (REFERENCE, {"payloads": [0.0, 2.5]}, "payload 2.5 kg"),
-        (REFERENCE, {"terrains": [*REFERENCE.matrix.terrains, "bars"]}, "terrain bars"),
+        (REFERENCE, {"seeds": [0, 1, 2, 3]}, "further seed 3"),
+        (REFERENCE, {"payloads": [0.0, 2.5]}, "further payload 2.5 kg"),
+        (REFERENCE, {"terrains": [*REFERENCE.matrix.terrains, "bars"]}, "further terrain bars"),
         (REFERENCE, {"level": 5}, "level 5 given, not searched for"),
         (
             OWN,
