@@ -13,7 +13,7 @@ from typing import Any
 from rich.text import Text
 
 from ..training.run.request import TrainRequest
-from ..training.tasks import find_task
+from ..training.tasks import find_task, named_robot
 from .console import Terminal, shell_command
 
 _WIDTH = 80
@@ -33,7 +33,8 @@ def print_settings(request: TrainRequest) -> None:
             console.say(Text(line, style))
 
     say(f"{chosen.shown}: {chosen.title}. Change a setting with KEY=VALUE, for example", 0)
-    robot = [] if request.robot is None else ["--robot", request.robot]
+    named = request.robot or named_robot(request.own_overrides())
+    robot = ["--robot", named] if named else []
     say(shell_command(["train", request.task, *robot, "training.run.iterations=3000"]), 0)
     for root, configuration in (("environment", chosen.environment), ("training", chosen.training)):
         for group, meaning, entries in _groups(root, configuration):

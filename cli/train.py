@@ -48,7 +48,7 @@ def run_training(request: TrainRequest, time: str | None) -> None:
     began = clock.monotonic()
     seconds = None if time is None else parse_duration(time)
     check_gpu(request)  # before torch is loaded
-    from ..training.processes import RUN_BEGAN
+    from ..training.processes import RUN_BEGAN, Processes
     from ..training.run.launch import train
     from ..training.run.plan import prepare
     from ..training.starting import processes_to_start, start_processes
@@ -60,7 +60,8 @@ def run_training(request: TrainRequest, time: str | None) -> None:
         return
     task = plan.request.task  # a ground and a robot have become a task
     # Of several processes, one for each GPU, the first prints; all count from the start of the command that started them.
-    began = float(os.environ.get(RUN_BEGAN, began))
+    if Processes.told().several:
+        began = float(os.environ.get(RUN_BEGAN, began))
     console = Terminal(quiet=os.environ.get("RANK", "0") != "0", may_lose=True)
     steps = plan.task.training.run.steps_per_iteration * plan.task.environment.num_envs
 

@@ -215,6 +215,21 @@ def test_commands_of_a_tile_are_reversed_and_short_where_it_says_so():
         assert not (same.command[:, :2] == -before[:, :2]).all(dim=1).any(), "a first command, or another tile"
 
 
+@pytest.mark.parametrize("extreme", [False, True])
+@pytest.mark.parametrize("forward", [0.05, -0.5])
+def test_the_way_back_to_a_heading_is_no_part_of_what_is_reversed(extreme, forward):
+    """A reversed extreme command may hold a heading, too; its opposite is drawn by ``flip_probability``."""
+    kinds = (replace(TILES[0], reversal_probability=0.5), TILES[1])
+    flips = replace(PLAIN, flip_probability=0.2)
+    before, held = torch.tensor([forward, 0.0, 0.6]).expand(COUNT, 3), torch.ones(COUNT, dtype=torch.bool)
+    begun = torch.ones(COUNT, dtype=torch.int64)
+    state = {"episode_length": begun, "command": before, "holds_heading": held, "extreme": held & extreme}
+    command = draw(flips, tiles=kinds, **state).command
+    opposite = (command[:, 0] == -forward) & (command[:, 1] == 0.0)
+    assert opposite.any() == (extreme or forward == -0.5), "hardly a walk is not reversed"
+    assert (command[opposite, 2] == 0.0).all()
+
+
 def test_a_tile_has_its_own_share_of_halts_and_of_turns_on_the_spot():
     kinds = (replace(TILES[0], stationary_probability=2.0, stationary_yaw_probability=3.0), TILES[1])
     still = replace(PLAIN, stationary_probability=Ramp(start=0.2, end=0.2))

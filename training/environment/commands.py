@@ -195,6 +195,8 @@ class CommandGenerator:
         """
         settings, ranges = self._configuration, self.ranges(kind, progress)
         low, high = ranges.low, ranges.high
+        if self._reverses:  # alone makes opposites of commands that hold a heading
+            command = torch.cat((command[:, :2], command[:, 2:].masked_fill(holds_heading[:, None], 0.0)), dim=1)
         remaining = (self._length - episode_length).clamp_min(1)
         way = (settings.required_distance - issued.norm(dim=1) * ranges.interval).clamp_min(0.0)
         linear, yaw = self._uniform(uniform, ranges, way, remaining)
@@ -245,9 +247,7 @@ class CommandGenerator:
             moves, walks = squares.sum(dim=1) > _MOVES, squares[:, :2].sum(dim=1) > _MOVES
             reverses = (episode_length > 0) & (chance < ranges.reversal) & moves
             back = (straight_back < 0.5) & walks
-            reversed_ = torch.cat(
-                (opposite[:, :2], opposite[:, 2:].masked_fill((back | holds_heading)[:, None], 0.0)), dim=1
-            )
+            reversed_ = torch.cat((opposite[:, :2], opposite[:, 2:].masked_fill(back[:, None], 0.0)), dim=1)
             drawn = torch.where(reverses[:, None], reversed_, drawn)
             steps = torch.where(reverses, ranges.interval_steps.long(), steps)
             is_extreme = torch.where(reverses, extreme, is_extreme)
