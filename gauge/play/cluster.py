@@ -152,8 +152,10 @@ class ClusterWorkers:
         return any(seat.there for seat in self._seats)
 
     def send(self, worker: int, message: Play | Drop | Stop) -> None:
-        """See ``Transport.send``."""
+        """See ``Transport.send``; one that is not there is ``Lost``, which ``receive`` has yet to say, and gets nothing."""
         seat = self._seats[worker]
+        if not seat.there:
+            return
         seat.outbox.append(message)
         if seat.call is None:
             self._call(seat)

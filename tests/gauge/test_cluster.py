@@ -19,7 +19,7 @@ from gaitgauge.gauge.play import cluster, cluster_node
 from gaitgauge.gauge.play.cluster import Cluster, ClusterError, check_address
 from gaitgauge.gauge.play.cluster_node import Arrived, NodeWorker, fingerprint
 from gaitgauge.gauge.play.dispatcher import Speculation, play
-from gaitgauge.gauge.play.workers import Failed, Finished, InProcess, Job, Play, Progress, Stop, Worker
+from gaitgauge.gauge.play.workers import Drop, Failed, Finished, InProcess, Job, Play, Progress, Stop, Worker
 from gaitgauge.policy.contract import standard_contract
 from gaitgauge.policy.loading import load_policy
 from gaitgauge.policy.native import NativePolicy, StoredNetwork
@@ -317,10 +317,11 @@ def fake(monkeypatch, puppet_job):
 WALKS = [episode(MAXIMUM, seed=seed) for seed in range(4)]
 
 
-def played(workers) -> dict:
-    records: dict = {}
-    play([partial(plan_list, WALKS)], records, lambda record: None, workers, speculation=Speculation())
+def played(workers, walks=tuple(WALKS)) -> dict:
+    records, kept = {}, []
+    play([partial(plan_list, walks)], records, kept.append, workers, speculation=Speculation())
     workers.close()
+    assert len(kept) == len(records) == len(walks), "an episode was played twice"
     return {e: (r.summary(), r.samples.tobytes()) for e, r in records.items()}
 
 
@@ -352,6 +353,20 @@ def test_nothing_is_lost_and_nothing_differs(fake, expected, fate, caplog):
     assert played(workers) == expected
     assert ("was lost (The actor died); what it had is played again" in caplog.text) == ("die" in fate)
     assert (workers._ray.made > 2) == ("die" in fate)
+
+
+def test_a_worker_that_comes_late_is_sent_nothing_before(fake):
+    walks, asked = [episode(MAXIMUM, seed=seed) for seed in range(40)], itertools.count()
+    workers = fake(lambda actor, call: "waits" if actor == 1 and next(asked) < 12 else "")
+    seat = workers._seats[1]
+    workers.send(1, Drop([]))
+    assert not seat.there and seat.outbox == []
+    played(workers, walks)
+
+
+def test_a_worker_that_dies_before_it_comes_is_not_sent_anything(fake, expected, monkeypatch):
+    monkeypatch.setattr(cluster, "_PAUSE", 0.5)
+    assert played(fake(lambda actor, call: "dies" if (actor, call) == (1, 0) else "")) == expected
 
 
 @pytest.mark.parametrize(("call", "times"), [(0, 61), (1, 4)])
