@@ -9,10 +9,11 @@ from ..files.choices import cpu_threads
 from ..files.writing import same_file, write_atomically
 from ..policy.foreign.adapters import assumptions
 from ..policy.foreign.described import toml_lines
+from ..policy.foreign.readers import contract_beside
 from ..studies.doctor.diagnosis import Diagnosis, Outcome, diagnose
 from .console import Terminal, make_table, print_json
 from .errors import UserError
-from .policies import open_policy
+from .policies import open_policy, policy_file
 from .progress import ProgressDisplay
 from .requests import DoctorRequest
 
@@ -34,6 +35,10 @@ def examine_policy(choice: str, request: DoctorRequest) -> bool:
             raise UserError(f"--out is '{out}'; give a file that ends in .toml")
         if any(same_file(out, given) for given in (contract, request.robot) if given):
             raise UserError(f"--out is '{out}', which is read as --contract or --robot; give another file")
+        if (beside := contract_beside(policy_file(choice))) and same_file(out, beside):
+            raise UserError(
+                f"--out is '{out}', the contract that lies beside the policy and is read; give another file"
+            )
         if not out.absolute().parent.is_dir():
             raise UserError(f"folder '{out.parent}' of --out does not exist; create it first")
     policy, body = open_policy(choice, request.robot, trust=request.trust, contract_file=contract)

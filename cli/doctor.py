@@ -58,7 +58,7 @@ def run_doctor(request: DoctorRequest) -> bool:
         from .diagnosis import examine_policy
 
         return examine_policy(request.policy, request)
-    for name in ("contract", "robot", "out", "seconds", "trust"):
+    for name in ("contract", "robot", "out", "seconds", "trust", "threads"):
         if getattr(request, name):
             again = f"gaitgauge doctor POLICY --{name} …"
             raise UserError(f"--{name} is for the examination of a policy; name one: {again}")

@@ -19,20 +19,20 @@ from ..studies.reality.scoring import score_sets
 from .compare import show_comparison
 from .console import Terminal, make_table, print_json
 from .errors import UserError
-from .studies import own_folder, study_in
+from .studies import keep_others, own_folder, study_folder, study_in
 
 
 def run_replay(request: ReplayRequest, *, out: Path | None, json_output: bool) -> None:
     """Replay logs, print a table for each and where the files are."""
-    folder = out or Path("results") / f"replay-{_names(request.logs)}"
     name, data = "replay", "replay.json"
+    folder = study_folder(name, data, out=out, of=_names(request.logs))
     study_in(folder, name, name, replay, print_replay, request, data=data, json_output=json_output)
 
 
 def run_identify(request: IdentifyRequest, *, out: Path | None, json_output: bool) -> None:
     """Identify a robot, print its constants, what the logs do not tell, and residuals beside nominal ones."""
-    folder = out or Path("results") / f"identify-{_names(request.logs)}"
     name, data = "identify", "identify.json"
+    folder = study_folder(name, data, out=out, of=_names(request.logs))
     study_in(folder, name, name, identify_robot, print_identified, request, data=data, json_output=json_output)
     if not json_output:
         Terminal().say(f"set      {folder / request.name}.toml")
@@ -40,8 +40,9 @@ def run_identify(request: IdentifyRequest, *, out: Path | None, json_output: boo
 
 def run_preflight(request: PreflightRequest, *, out: Path | None, json_output: bool) -> bool:
     """Check a log against a policy, print a line for each check; return False where one is wrong."""
-    folder = out or Path("results") / f"preflight-{_names([request.log])}"
+    folder = study_folder("preflight", "preflight.json", out=out, of=_names([request.log]))
     with own_folder(folder):
+        keep_others(folder / "preflight.json")
         results = preflight(request, folder, command=["gaitgauge", *sys.argv[1:]])
     if json_output:
         print_json(results)

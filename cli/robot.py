@@ -90,25 +90,37 @@ def new_robot(model: Path, *, out: Path | None, name: str | None, force: bool, a
 def guess_again(path: Path) -> None:
     """Make the guesses of a description again, and print those that changed; raise ``RobotError`` where that fails."""
     text, changes, file = guessed_again(path)
-    earlier = file.read_bytes()
-    with ExitStack() as undo:
-        write_atomically(file, text, RobotError)
-        undo.callback(_restore, file, earlier)
-        load_robot_file(file)
-        undo.pop_all()
     console = Terminal()
-    console.say("\n  ".join((f"wrote {file}; guessed anew:" if changes else f"{file}: every guess stays", *changes)))
+    if changes:
+        earlier = file.read_bytes()
+        with ExitStack() as undo:
+            write_atomically(file, text, RobotError)
+            undo.callback(_restore, file, earlier)
+            load_robot_file(file)
+            undo.pop_all()
+        console.say("\n  ".join((f"wrote {file}, comments above keys kept; guessed anew:", *changes)))
+    else:
+        console.say(f"{file}: every guess stays")
     console.say(f"next:\n  {shell_command(['robot', 'check', str(file)])}")
 
 
 def convert_motor(
-    file: Path, *, robot: str, out: Path, error: str | None, activation: str | None, name: str, passive: bool
+    file: Path,
+    *,
+    robot: str,
+    out: Path,
+    error: str | None,
+    activation: str | None,
+    name: str,
+    passive: bool,
+    force: bool,
 ) -> None:
     """Write an actuator network as ``NAME.npz`` and a parameter set that uses it as ``NAME.toml``.
 
     Raises:
         MotorNetworkError, PolicyError: the file cannot be used.
         RobotError: no such robot.
+        UserError: an option does not fit, or a file is there and is not to be replaced.
     """
     from ..policy.foreign.motor_files import Description, read_motor_file
     from ..robots.motor_network import save_motor_network
@@ -118,6 +130,8 @@ def convert_motor(
         raise UserError(f"--name is '{name}'; use letters, digits and _")
     if error not in (None, *(signs := {"target-position": 1, "position-target": -1})):
         raise UserError(f"--error is '{error}'; it must be target-position or position-target")
+    for end in ("npz", "toml"):
+        _refuse_existing(out / f"{name}.{end}", force)
     described = None
     if error is not None:
         described = Description(error_sign=signs[error], activation=activation or "softsign")  # type: ignore[arg-type]

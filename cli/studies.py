@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import partial
@@ -12,6 +13,7 @@ from typing import Any
 
 import typer
 
+from ..files.parsing import one_line, read_results
 from ..files.writing import LOCK, lock_folder, make_folder
 from ..studies.naming import found_policies, free_folder, joined_names
 from ..studies.policies import lost_policy
@@ -63,6 +65,41 @@ def own_folder(folder: Path) -> Iterator[None]:
         lock.release()
 
 
+def study_folder(name: str, data: str, *, out: Path | None, of: str) -> Path:
+    """Return ``out``, or the first of ``results/<name>-<of>``, ``…-2`` … in which no other results would be lost."""
+    return out or free_folder(Path("results") / f"{name}-{of}", lambda path: _lost(path / data) is None)
+
+
+def keep_others(file: Path, policies: Sequence[str] = ()) -> None:
+    """Refuse to write over results of other policies or of another command line. Raises UserError."""
+    if lost := _lost(file, policies):
+        raise UserError(f"'{file.parent}' holds {lost}, which would be lost; give another folder with --out")
+
+
+def _lost(file: Path, policies: Sequence[str] = ()) -> str | None:
+    """Return what of other policies or of another command line a study's results hold; None for nothing."""
+    if policies and (lost := lost_policy(file, policies)):
+        return f"policy {lost}"
+    try:
+        command = read_results(file, "results", UserError)["provenance"]["command"] if file.is_file() else ""
+        same = not command or _asked(shlex.split(command)[1:]) == _asked(sys.argv[1:])
+    except (UserError, KeyError, TypeError, ValueError):
+        return None  # not what a study wrote
+    return None if same else f"the results of '{one_line(command, 200)}'"
+
+
+def _asked(arguments: Sequence[str]) -> list[str]:
+    """Return arguments without those that change no result."""
+    words = iter(arguments)
+    found = []
+    for word in words:
+        if word in ("--out", "--threads"):
+            next(words, None)
+        elif word != "--json" and not word.startswith(("--out=", "--threads=")):
+            found.append(word)
+    return found
+
+
 def show_turn(display: ProgressDisplay, turn: Turn) -> None:
     """Show how far a study of several turns is."""
     text = f"{turn.number} of {turn.count}: {turn.what}"
@@ -80,17 +117,20 @@ def study_in(
     *,
     data: str,
     json_output: bool,
-    check: Callable[[], None] = lambda: None,
+    policies: Sequence[str] = (),
 ) -> Mapping[str, Any]:
     """Make a study in a folder of its own, print it and its files; return its results.
 
     Args:
         name: its page is ``<name>.html``.
-        check: called in the locked folder before anything is played.
+        policies: files of the policies that are studied.
+
+    Raises:
+        UserError: the folder holds other results.
     """
     # the folder first: an error in it is shown before anything is played
     with own_folder(folder), ProgressDisplay(Terminal(stderr=True), title) as display:
-        check()
+        keep_others(folder / data, policies)
         command = ["gaitgauge", *sys.argv[1:]]
         results = study(request, folder, command=command, watch=partial(show_turn, display))
     show_results(results, show, folder / data, folder / f"{name}.html", json_output=json_output)
@@ -132,14 +172,9 @@ def make_study(
     """
     files = found_policies(policy_files(request.policies))
     usual = Path("results") / f"{name}-{joined_names(request.policies)}"
-    folder = out or free_folder(usual, lambda path: lost_policy(path / data, files) is None)
+    folder = out or free_folder(usual, lambda path: _lost(path / data, files) is None)
     request = replace(request, policies=policy_files(request.policies))
-
-    def check() -> None:
-        if lost := lost_policy(folder / data, files):
-            raise UserError(f"'{folder}' holds policy {lost}, which would be lost; give another folder with --out")
-
-    results = study_in(folder, name, title, study, show, request, data=data, json_output=json_output, check=check)
+    results = study_in(folder, name, title, study, show, request, data=data, json_output=json_output, policies=files)
     errors = Terminal(stderr=True)
     for refused in results["refused"]:
         errors.say(f"{refused['what']} was left out: {refused['reason']}")

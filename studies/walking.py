@@ -13,6 +13,7 @@ import torch
 
 from ..backends.base import PhysicsBackend, PhysicsState, ResetState
 from ..gauge.episodes import Episode
+from ..gauge.play.control_step import fixed_delay
 from ..gauge.play.noise import NoiseReader, make_stream
 from ..gauge.suite import Noise
 from ..policy.base import Policy, PolicyError, PolicySession
@@ -64,6 +65,7 @@ class Walk:
             self._noise = NoiseReader(stream, count, device)
             self._noise.begin(range(count), episodes, [0] * count, steps)
         self._action = torch.zeros(count, policy.contract.num_joints, device=device)
+        self._measured = fixed_delay(backend.scene, count, device)
         self._latency: torch.Tensor | None = None
         if any(late is not None for late in latency):
             self._latency = torch.tensor([-1 if late is None else late for late in latency], device=device)
@@ -103,6 +105,8 @@ class Walk:
             PolicyError: the policy's output is not finite.
         """
         noise, delay = (None, None) if self._noise is None else self._noise.next()
+        if self._measured is not None:
+            delay = self._measured
         observation = self._builder.build(self.state, command, self._action, noise)
         action = self._session.act(observation)
         if worlds is not None:

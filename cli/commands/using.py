@@ -136,6 +136,7 @@ def motor(
         str | None, Choice("Between its linear layers. Default: softsign.", values=ACTIVATIONS)
     ] = None,
     passive: Annotated[bool, Choice("Keep the robot's rotor inertia and friction beside the network.")] = False,
+    force: Annotated[bool, Choice("Replace files that are there.")] = False,
 ) -> None:
     """Make a parameter set of an actuator network: motors that were learned on a real robot.
 
@@ -145,7 +146,9 @@ def motor(
     """
     from ..robot import convert_motor
 
-    convert_motor(file, robot=robot, out=out, error=error, activation=activation, name=name, passive=passive)
+    convert_motor(
+        file, robot=robot, out=out, error=error, activation=activation, name=name, passive=passive, force=force
+    )
 
 
 app.add_typer(contract, name="contract")

@@ -106,6 +106,11 @@ def study_latents(
 def _ground(request: LatentRequest) -> tuple[Suite, tuple[Terrain, ...]]:
     """The rules, and what is walked on."""
     suite = load_suite(request.suite)
+    if suite.ground is not None:
+        raise SuiteError(
+            f"suite '{suite.name}' builds its ground in each robot's own measure, and latents are compared on one ground; give "
+            "another --suite"
+        )
     check_friction(request.friction)
     names = request.terrains or tuple(gauge_terrain_names())
     terrains = tuple(make_terrain(n, None if n == "flat" else request.level) for n in dict.fromkeys(names))

@@ -43,7 +43,7 @@ def score_sets(
     if len(sets) < 2 or len(set(labels)) < len(labels):
         given = ", ".join(sets) or "none"
         raise LogError(
-            f"a policy is compared under two or more different parameter sets, and {given} was given (--parameters)"
+            f"a policy is compared under two or more different parameter sets, and {given} was given; name them behind the policy"
         )
     request = deciding_request(request, say)
     prepared = [prepare(replace(request, parameters=name)) for name in sets]

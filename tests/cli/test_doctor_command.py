@@ -59,6 +59,13 @@ def test_what_is_read_is_not_written_over(refused, backwards, tmp_path, option):
     assert mine.read_text() == "# mine"
 
 
+def test_the_contract_beside_the_policy_is_not_written_over(refused, backwards):
+    mine = backwards.with_name("contract.toml")
+    mine.write_text("# mine")
+    assert "lies beside the policy and is read; give another file" in refused("doctor", backwards, "--out", mine)
+    assert mine.read_text() == "# mine"
+
+
 def test_json_holds_it_all(run, monkeypatch):
     fitting = diagnosis.fitting_presets
 
@@ -80,7 +87,8 @@ def test_a_file_that_is_no_policy_is_refused(refused, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "option", [("--contract", "it"), ("--robot", "it"), ("--out", "it"), ("--seconds", 1), ("--trust",)]
+    "option",
+    [("--contract", "it"), ("--robot", "it"), ("--out", "it"), ("--seconds", 1), ("--trust",), ("--threads", 1)],
 )
 def test_what_is_for_a_policy_is_refused_without_one(refused, option):
     assert f"{option[0]} is for the examination of a policy" in refused("doctor", *option)

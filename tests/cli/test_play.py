@@ -44,6 +44,20 @@ def test_world_is_that_of_the_suite(session, tmp_path):
     assert session(suite=str(suite)).backend.scene.physics.substeps == 4
 
 
+def test_a_measured_delay_acts_as_it_does_in_the_gauge(session, monkeypatch):
+    played = session(parameters="identified")
+    seen = []
+    step = played.backend.step
+    monkeypatch.setattr(
+        played.backend,
+        "step",
+        lambda *given, delay=None, **more: seen.append(delay) or step(*given, delay=delay, **more),
+    )
+    played.step((0.0, 0.0, 0.0))
+    physics, late = played.backend.scene.physics, played.backend.scene.parameters.delay
+    assert [each.tolist() for each in seen] == [[round(late / physics.timestep)]]
+
+
 def test_world_has_the_parameter_set_that_was_asked_for(session):
     played = session(parameters="identified").backend.scene.parameters
     assert played.armature == ROBOT.parameters["identified"].armature != ROBOT.parameters["gauge"].armature

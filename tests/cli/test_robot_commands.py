@@ -206,3 +206,21 @@ def test_an_unseen_robot_goes_from_its_model_to_a_score_in_five_commands(run, mo
     assert again.exit_code == 0, again.output
     assert "the robot is the copy that the policy carries" in again.stderr
     assert json.loads(Path("results/again/results.json").read_text())["score"] == results["score"]
+
+
+def test_a_description_whose_guesses_stay_is_not_written(run, model):
+    assert run("robot", "new", model, "--out", "mine").exit_code == 0
+    file = Path("mine/robot.toml")
+    file.write_text(f"# owner: me\n{file.read_text()}# the end\n")
+    before = file.read_text()
+    done = run("robot", "guess", file)
+    assert "every guess stays" in done.stdout and file.read_text() == before
+
+
+@pytest.mark.parametrize("end", ["npz", "toml"])
+def test_a_motor_s_files_are_not_replaced_unasked(refused, tmp_path, end):
+    (tmp_path / f"network.{end}").write_text("mine")
+    words = ("robot", "motor", tmp_path / "net.pt", "go2", "--out", tmp_path)
+    assert f"network.{end}' already exists" in refused(*words) and "--force" in refused(*words)
+    assert "already exists" not in refused(*words, "--force")
+    assert (tmp_path / f"network.{end}").read_text() == "mine"

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from gaitgauge.gauge.episodes import Episode
-from gaitgauge.gauge.suite import load_suite
+from gaitgauge.gauge.suite import SuiteError, load_suite
 from gaitgauge.policy.contract import standard_contract
 from gaitgauge.policy.loading import load_policy
 from gaitgauge.policy.native import StoredNetwork, save_policy
@@ -283,3 +283,9 @@ def test_every_class_has_a_colour_of_its_own():
     """From the ninth terrain on, colours of the legend repeated."""
     colours = [_colour(index) for index in range(40)]
     assert len(set(colours)) == 40
+
+
+def test_a_suite_with_ground_in_each_robot_s_measure_is_refused(tmp_path):
+    request = LatentRequest(policies=("pretrained-g1",), suite="gaitgauge-biped-1")
+    with pytest.raises(SuiteError, match="builds its ground in each robot's own measure"):
+        study_latents(request, tmp_path)

@@ -1,0 +1,42 @@
+"""Results of another command are never written over: the next folder takes the new ones, or ``--out`` is refused."""
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+from gaitgauge.cli.errors import UserError
+from gaitgauge.cli.studies import keep_others, study_folder
+
+
+def result(folder: Path, command: str) -> None:
+    folder.mkdir(parents=True)
+    (folder / "identify.json").write_text(json.dumps({"provenance": {"command": command}}))
+
+
+@pytest.mark.parametrize(
+    ("command", "kept"),
+    [
+        ("gaitgauge identify mon/chirp.npz", True),
+        ("gaitgauge identify tue/chirp.npz --draws 9", True),
+        ("/usr/bin/gaitgauge identify tue/chirp.npz --threads 2 --json", False),
+        ("gaitgauge identify tue/chirp.npz --out=results/identify-chirp", False),
+    ],
+)
+def test_results_of_another_command_are_kept(tmp_path, monkeypatch, command, kept):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["gaitgauge", "identify", "tue/chirp.npz"])
+    usual = Path("results/identify-chirp")
+    result(usual, command)
+    chosen = study_folder("identify", "identify.json", out=None, of="chirp")
+    assert chosen == (usual.with_name("identify-chirp-2") if kept else usual)
+    keep_others(chosen / "identify.json")
+    if kept:
+        with pytest.raises(UserError, match=f"'{usual}' holds the results of '{command}', which would be lost"):
+            keep_others(usual / "identify.json")
+
+
+@pytest.mark.parametrize("text", ["{", "[]", '{"provenance": 3}'])
+def test_a_file_that_no_study_wrote_is_no_result(tmp_path, text):
+    (tmp_path / "identify.json").write_text(text)
+    keep_others(tmp_path / "identify.json")
