@@ -270,7 +270,9 @@ class TrainingRunner(RunState):
         self.scores.take(seconds, stop)
         self.videos.take(seconds, stop)
         if self.scores.pending and not stop():
-            self.message("The last checkpoint has no score: a training waits training.run.gauge_wait for it, with --time not at all.")
+            self.message(
+                "The last checkpoint has no score: a training waits training.run.gauge_wait for it, with --time not at all."
+            )
 
     def _snapshot(self, total: int, elapsed: float) -> Progress:
         interval, ahead = self.configuration.run.gauge_interval, total - self.iteration
