@@ -270,7 +270,7 @@ def serve(sessions: Sequence[PlaySession], maker: WorldMaker, chosen: Choice, as
     server.scene.add_grid("/floor", width=40.0, height=40.0, cell_size=1.0, section_size=5.0)
     panel, page = Panel(server, chosen, sessions, asked.command), Page(server, sessions)
     console = Terminal()
-    shown = "localhost" if is_loopback(host) else host
+    shown = "localhost" if host == "127.0.0.1" else f"[{host}]" if ":" in host else host
     console.say(f"open http://{shown}:{server.get_port()} in a browser; Ctrl-C ends")
     if not is_loopback(host):
         console.say(f"everybody who reaches {host} can steer this robot; leave --host out to serve this machine alone")

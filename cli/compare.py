@@ -12,10 +12,11 @@ from rich.text import Text
 
 from ..gauge.request import EvaluationOptions, Request
 from ..studies.compare.comparison import format_p
-from ..studies.compare.contestants import compare_all
+from ..studies.compare.contestants import compare_all, is_result
 from ..studies.naming import joined_names
 from .console import Terminal, make_table, print_json
 from .evaluate import shower
+from .policies import policy_files
 from .studies import resumable
 
 
@@ -23,8 +24,9 @@ def run_comparison(
     contestants: Sequence[str], choices: EvaluationOptions, *, out: Path | None, json_output: bool
 ) -> None:
     """Compare, show progress, print which differences are real and where the files are."""
-    request = Request(policy=contestants[0], **vars(choices))
-    work = partial(compare_all, contestants, request)
+    files = [each if is_result(each) else policy_files([each])[0] for each in contestants]
+    request = Request(policy=files[0], **vars(choices))
+    work = partial(compare_all, files, request)
     show_comparison(work, f"compare-{joined_names(contestants)}", out=out, json_output=json_output)
 
 

@@ -17,6 +17,7 @@ from ..studies.consistency.request import StudyCost, StudyRequest, StudyStatus
 from ..studies.consistency.study import prepare_study, study
 from ..studies.naming import free_run_folder, joined_names
 from .console import Terminal, make_table, print_json
+from .policies import policy_files
 from .progress import ProgressDisplay, duration
 from .studies import resumable
 
@@ -25,11 +26,12 @@ def run_consistency(
     request: StudyRequest, backends: str | None, *, out: Path | None, resume: bool, json_output: bool
 ) -> None:
     """Make the study, show progress, print the tables and where the files are."""
-    request = replace(request, backends=() if backends is None else tuple(backends.split(",")))
+    named = () if backends is None else tuple(backends.split(","))
+    usual = Path("results") / f"{joined_names(request.policies)}-{bare_name(request.suite)}-consistency"
+    request = replace(request, backends=named, policies=policy_files(request.policies))
     console = Terminal(stderr=True)
     prepared = prepare_study(request)  # all that can be wrong with the request is said before anything is written
     _print_skipped(console, prepared.skipped)
-    usual = Path("results") / f"{joined_names(request.policies)}-{bare_name(request.suite)}-consistency"
     folder = out or free_run_folder(usual, *prepared.runs)
     with resumable(console, "comparing", folder, "--resume") as display:
         own = ["gaitgauge", *sys.argv[1:]]

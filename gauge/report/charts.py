@@ -45,7 +45,7 @@ def terrain_label(name: str) -> str:
 
 def number(value: float) -> str:
     """Return a number as short as it goes, to three decimals, with a true minus sign."""
-    return f"{round(value, 3):g}".replace("-", "−")
+    return f"{round(value, 3) + 0.0:g}".replace("-", "−")
 
 
 def strip(

@@ -90,7 +90,7 @@ def read_measurements(path: Path) -> Measurements:
     text = read_text(path, "table", ValidationError)
     reader = csv.DictReader(text.splitlines(), strict=True)
     try:
-        rows = list(reader)
+        rows = [(reader.line_num, row) for row in reader]
     except csv.Error as error:
         raise ValidationError(f"{one_line(path)} is not valid CSV: {error}") from error
     names = [n for n in reader.fieldnames or () if n not in ("policy", "motion", "command")]
@@ -105,7 +105,7 @@ def read_measurements(path: Path) -> Measurements:
         raise ValidationError(f"{one_line(path)} has two columns of one name")
     sums: dict[str, dict[str, list[list[float]]]] = {}
     commands: dict[str, str] = {}
-    for number, row in enumerate(rows, 2):
+    for number, row in rows:
         policy, motion = row.get("policy") or _LONE, row["motion"]
         if None in row or not motion:
             raise ValidationError(f"line {number} of {one_line(path)} does not have the columns of the first line")

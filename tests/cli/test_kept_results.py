@@ -1,4 +1,4 @@
-"""Results of another command are never written over: the next folder takes the new ones, or ``--out`` is refused."""
+"""What a command keeps and takes: results of another command are never written over, a run directory is its checkpoint."""
 
 import json
 import sys
@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from gaitgauge.cli.errors import UserError
 from gaitgauge.cli.studies import keep_others, study_folder
+from gaitgauge.policy.finding import latest_checkpoint
 
 
 def result(folder: Path, command: str) -> None:
@@ -40,3 +41,10 @@ def test_results_of_another_command_are_kept(tmp_path, monkeypatch, command, kep
 def test_a_file_that_no_study_wrote_is_no_result(tmp_path, text):
     (tmp_path / "identify.json").write_text(text)
     keep_others(tmp_path / "identify.json")
+
+
+def test_studies_take_a_run_directory_for_its_checkpoint(refused, trained):
+    """As every command that takes a policy does."""
+    assert "unknown backend 'nope'" in refused("consistency", trained, "--backends", "mujoco,nope")
+    said = refused("compare", trained, latest_checkpoint(trained), "--terrain", "flat", "--seed", 0, "--seed", 1)
+    assert "is a folder" not in said and str(latest_checkpoint(trained)) in said

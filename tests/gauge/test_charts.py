@@ -147,3 +147,7 @@ def test_seeds_of_a_sweep_s_entry_share_its_colour_and_differ_in_their_dashes(se
         f"CTS HIM ; {legend}"
     )
     assert re.findall(r"curve c3 (d\d)", note) == (dashes[:4] if seeds > 1 else [])
+
+
+def test_numbers_have_a_true_minus_and_no_negative_zero():
+    assert [charts.number(value) for value in (-0.25, -0.0001, 0.0004, 1.5)] == ["−0.25", "0", "0", "1.5"]

@@ -38,6 +38,8 @@ def test_variants_are_read_and_named():
     changed = {"timestep": 0.005, "cone": "pyramidal", "self_collision": False, "contacts_per_world": 20}
     assert dict(variant.overrides) == changed
     assert parse_variant(variant.label) == variant
+    third = parse_variant("mujoco@timestep=0.003333333333")
+    assert parse_variant(third.label) == third
     assert parse_variant("mujoco@cone=pyramidal@timestep=0.001") == parse_variant(
         "mujoco@timestep=0.001@cone=pyramidal"
     )

@@ -123,6 +123,7 @@ def test_errors_of_several_policies_are_averaged_and_their_ranks_compared(tmp_pa
         ("motion\nwalk\n", "a column for each metric"),
         ("motion,m\n", "a row for each trial"),
         ("motion,m\nwalk,fast\n", "m in line 2 of .* is 'fast'; a number is needed"),
+        ("motion,m\nwalk,1\n\n\nwalk,fast\n", "m in line 5 of .* is 'fast'; a number is needed"),
         ("motion,m\nwalk,nan\n", "is 'nan'; a number is needed"),
         ("motion,m\nwalk\n", "is None; a number is needed"),
         ("motion,m\nwalk,1,2\n", "line 2 of .* does not have the columns of the first line"),
