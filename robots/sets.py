@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -75,11 +77,11 @@ def set_text(robot: Robot, name: str, values: Mapping[str, Any], provenance: str
         if len(set(texts)) == 1:
             lines.append(f"{key} = {texts[0]}")
         elif all(len({texts[j] for j in joints}) == 1 for joints in groups.values()):
-            kinds = ", ".join(f"{group} = {texts[joints[0]]}" for group, joints in groups.items())
+            kinds = ", ".join(f"{_key(group)} = {texts[joints[0]]}" for group, joints in groups.items())
             lines.append(f"{key} = {{ {kinds} }}")
         else:
             lines.append(f"{key} = [{', '.join(texts)}]")
-    return "\n".join([*lines, f'measured = "{_quoted(provenance)}"', ""])
+    return "\n".join([*lines, f"measured = {json.dumps(provenance, ensure_ascii=False)}", ""])
 
 
 def network_text(robot: Robot, name: str, base: JointParameters, network: MotorNetwork, *, passive: bool) -> str:
@@ -102,5 +104,6 @@ def _digits(value: float) -> str:
     return text if any(c in text for c in ".e") else f"{text}.0"
 
 
-def _quoted(text: str) -> str:
-    return text.replace("\\", "\\\\").replace('"', '\\"')
+def _key(name: str) -> str:
+    """Return a name as a key of TOML."""
+    return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else json.dumps(name, ensure_ascii=False)

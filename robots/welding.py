@@ -21,7 +21,7 @@ def welded(robot: Robot, folder: Path, held: Sequence[str] = ()) -> Robot:
     hold them.
 
     Raises:
-        RobotError: such a joint and a driven one move the same body.
+        RobotError: such a joint and a driven one move the same body, or an equality ties them.
     """
     import mujoco
 
@@ -33,7 +33,17 @@ def welded(robot: Robot, folder: Path, held: Sequence[str] = ()) -> Robot:
     spec = mujoco.MjSpec.from_file(str(robot.mjcf))
     for element in [*spec.actuators, *spec.sensors, *spec.keys]:
         spec.delete(element)  # they may name the joints
-    for name in set(robot.joint_names) - set(driven) - set(held):
+    rigid = set(robot.joint_names) - set(driven) - set(held)
+    for tie in [each for each in spec.equalities if each.type == mujoco.mjtEq.mjEQ_JOINT]:
+        tied = {name for name in (tie.name1, tie.name2) if name}
+        if loose := tied - rigid if tied & rigid else set():
+            raise RobotError(
+                f"robot '{robot.name}': the joint '{min(tied & rigid)}' cannot be made rigid, since an equality ties it to "
+                f"'{min(loose)}'; drive both, or hold both"
+            )
+        if tied & rigid:
+            spec.delete(tie)
+    for name in rigid:
         body = spec.joint(name).parent
         if any(joint.name in driven for joint in body.joints):
             raise RobotError(

@@ -395,13 +395,14 @@ class MujocoBackend(PhysicsBackend):
         ones = np.ones(self.scene.robot.num_joints)
         strength = values.get("motor_strength", ones)
         kp_scale, kd_scale = values.get("stiffness_scale", ones), values.get("damping_scale", ones)
-        scale = np.where(self._by_velocity, kd_scale, kp_scale)
+        # a torque is commanded as it is: no gain acts on it
+        scale = ones if self._direct else np.where(self._by_velocity, kd_scale, kp_scale)
         model.actuator_gainprm[:, 0] = nominal.actuator_gainprm[:, 0] * scale * strength
         model.actuator_biasprm[:, 1] = np.where(self._by_velocity | self._direct, 0.0, -model.actuator_gainprm[:, 0])
         model.actuator_biasprm[:, 2] = nominal.actuator_biasprm[:, 2] * kd_scale * strength
         model.actuator_forcerange[:] = nominal.actuator_forcerange * strength[:, None]
         self._strength[row], self._speed[row] = strength, values.get("motor_speed", 1.0)
-        self._offset[row] = np.where(self._by_velocity, 0.0, values.get("motor_offset", 0.0))
+        self._offset[row] = np.where(self._by_velocity | self._direct, 0.0, values.get("motor_offset", 0.0))
 
     def _read_gains(self, rows: Sequence[int] | NDArray[np.int64]) -> None:
         """Read kp and strength of each motor, and kd/kp, from which the torque-free target follows."""

@@ -135,9 +135,15 @@ def read_robot(scene: Scene) -> RobotModel:
     """Return the robot of a scene.
 
     Raises:
-        BackendError: the robot has a joint other than hinges at the reference angle 0, or a shape that no engine here knows.
+        BackendError: the robot has a joint other than hinges at the reference angle 0, a spring, an equality or a tendon, or a shape
+            that no engine here knows.
     """
     robot, model = scene.robot, robot_spec(scene).compile()
+    unknown = {"springs in its joints": model.jnt_stiffness.any(), "equalities": model.neq, "tendons": model.ntendon}
+    for what in (words for words, there in unknown.items() if there):
+        raise BackendError(
+            f"robot '{robot.name}' has {what}, which this engine does not simulate; use --backend mujoco"
+        )
     order = {model.joint(name).id: i for i, name in enumerate(robot.joint_names)}
     data = mujoco.MjData(model)
     data.qpos[:7] = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)

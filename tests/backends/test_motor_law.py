@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from gaitgauge.backends import BackendError, PhysicsOptions, ResetState, Scene, make_backend
+from gaitgauge.backends import BackendError, PhysicsOptions, Randomization, ResetState, Scene, make_backend
 from gaitgauge.backends.motor_law import MotorLimits, motor_torque
 from gaitgauge.robots import load_robot
 from gaitgauge.terrains.base import Terrain
@@ -110,3 +110,20 @@ def test_mujoco_moves_slow_joints_alike_and_holds_fast_ones_back():
     calves = slice(2, 12, 3)
     assert free[calves].max() > 17.0
     assert limited[calves].max() < 15.65 + 0.5  # gravity and the thighs may push a little
+
+
+def test_no_gain_and_no_offset_acts_on_a_torque():
+    direct = replace(GO2.parameters["gauge"], motor="torque")
+    backend = make_backend("mujoco", scene(parameters=direct), device="cpu")
+    still = torch.zeros(1, 12, dtype=torch.float64)
+    pose = torch.tensor([GO2.default_joint_position], dtype=torch.float64)
+    backend.randomize(Randomization(motor_offset=still + 0.5, stiffness_scale=still + 1.3, motor_strength=still + 0.5))
+    backend.reset(
+        ResetState(
+            base_position=torch.tensor([[0.0, 0.0, 2.0]], dtype=torch.float64),
+            base_quaternion=torch.tensor([[1.0, 0.0, 0.0, 0.0]], dtype=torch.float64),
+            joint_position=pose,
+        )
+    )
+    backend.step(still + 2.0)
+    np.testing.assert_allclose(backend.state.joint_torque.numpy(), 1.0)  # half as strong

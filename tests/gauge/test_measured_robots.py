@@ -103,3 +103,17 @@ def test_an_offset_acts_in_the_engine(file):
     backend.step(start, substeps=1)
     expected = torch.tensor([0.2, 0.2, 0.16] * 4, dtype=torch.float64)  # kp · factor · offset
     torch.testing.assert_close(backend.state.joint_torque[0], expected, atol=1e-9, rtol=0.0)
+
+
+@pytest.mark.parametrize("between", [".", "/", " "])
+def test_a_set_is_read_back_whatever_joints_and_provenance_hold(tmp_path, between):
+    names = tuple(name.removesuffix("_joint").replace("_", between) for name in GO2.joint_names)
+    robot = replace(GO2, joint_names=names)
+    own, values = GO2.parameters["gauge"], tuple(0.01 + 0.001 * i for i in range(12))
+    fields = ("stiffness", "damping", "torque_limit", "joint_damping", "friction_loss")
+    mine = {field: getattr(own, field) for field in fields} | {"armature": values}
+    text = set_text(robot, "mine", mine, 'two\nlines "of" it')
+    file = tmp_path / "mine.toml"
+    file.write_text(text)
+    found = find_set(robot, str(file))[1]
+    assert found.armature == pytest.approx(values) and found.measured == 'two\nlines "of" it'

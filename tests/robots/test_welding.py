@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import mujoco
 import numpy as np
 import pytest
 from gaitgauge.robots import RobotError, load_robot
@@ -47,3 +48,31 @@ def test_half_of_a_body_cannot_be_rigid(tmp_path):
         RobotError, match="the joint 'b' cannot be made rigid, since a driven joint moves the same body 'leg'"
     ):
         welded(robot, tmp_path)
+
+
+@pytest.mark.parametrize(("driven", "ties"), [(("a", "b"), 0), (("a", "b", "c"), None)])
+def test_an_equality_of_rigid_joints_goes_and_one_that_ties_a_driven_joint_is_refused(tmp_path, driven, ties):
+    legs = "".join(
+        f'<body name="{n}_leg" pos="0 {i} -.3"><joint name="{n}" axis="1 0 0"/><geom name="{n}_foot" size=".02"/></body>'
+        for i, n in enumerate("abcd")
+    )
+    (tmp_path / "model.xml").write_text(
+        f'<mujoco><worldbody><body name="trunk"><freejoint/><geom size=".1"/>{legs}</body></worldbody>'
+        '<equality><joint joint1="c" joint2="d"/></equality></mujoco>'
+    )
+    robot = replace(
+        G1,
+        mjcf=tmp_path / "model.xml",
+        base_body="trunk",
+        joint_names=tuple("abcd"),
+        default_joint_position=(0.0,) * 4,
+        action_scale=(1.0,) * 4,
+        parameters={},
+        driven_joints=driven,
+    )
+    (tmp_path / "out").mkdir()
+    if ties is None:
+        with pytest.raises(RobotError, match="'d' cannot be made rigid, since an equality ties it to 'c'"):
+            welded(robot, tmp_path / "out")
+    else:
+        assert mujoco.MjModel.from_xml_path(str(welded(robot, tmp_path / "out").mjcf)).neq == ties
