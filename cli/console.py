@@ -146,6 +146,14 @@ def make_table(title: str, *columns: str, numbers: bool = False) -> Table:
     return table
 
 
+def without_options(arguments: Sequence[str], *options: str) -> list[str]:
+    """Return arguments without some options and the values of these, given as ``--option value`` or ``--option=value``."""
+    words = list(arguments)
+    for i in reversed([i for i, word in enumerate(words) if word.partition("=")[0] in options]):
+        del words[i : i + 1 + (words[i] in options)]
+    return words
+
+
 def shell_command(arguments: Sequence[str] | None = None, *more: str) -> str:
     """Return a command for a shell: this one, without ``--resume``, or one of the arguments given."""
     own = [a for a in sys.argv[1:] if a != "--resume"] if arguments is None else arguments

@@ -17,6 +17,7 @@ from pathlib import Path
 
 from ..files.writing import json_text, write_atomically
 from ..version import __version__
+from .console import without_options
 
 _LEAST = 10.0
 """Time of a command that is worth remembering [s]."""
@@ -41,9 +42,7 @@ class Remembered:
 
     def __init__(self, arguments: Sequence[str], folder: Path | None) -> None:
         """Read what the folder has of the command line without its program; without a folder nothing is remembered."""
-        words = list(arguments)
-        for i in reversed([i for i, word in enumerate(words) if word.partition("=")[0] == "--out"]):
-            del words[i : i + 1 + (words[i] == "--out")]
+        words = without_options(arguments, "--out")
         key = json.dumps([__version__, os.cpu_count(), words])
         name = hashlib.sha256(key.encode("utf-8", "backslashreplace")).hexdigest()[:16]
         self._path = folder / f"{name}.json" if folder is not None and "--resume" not in words else None

@@ -18,7 +18,7 @@ from ..files.writing import LOCK, lock_folder, make_folder
 from ..studies.naming import found_policies, free_folder, joined_names
 from ..studies.policies import lost_policy
 from ..studies.turns import Turn
-from .console import Terminal, print_json, shell_command
+from .console import Terminal, print_json, shell_command, without_options
 from .errors import UserError
 from .policies import policy_files
 from .progress import ProgressDisplay
@@ -65,9 +65,9 @@ def own_folder(folder: Path) -> Iterator[None]:
         lock.release()
 
 
-def study_folder(name: str, data: str, *, out: Path | None, of: str) -> Path:
+def study_folder(name: str, data: str, *, out: Path | None, of: str, policies: Sequence[str] = ()) -> Path:
     """Return ``out``, or the first of ``results/<name>-<of>``, ``…-2`` … in which no other results would be lost."""
-    return out or free_folder(Path("results") / f"{name}-{of}", lambda path: _lost(path / data) is None)
+    return out or free_folder(Path("results") / f"{name}-{of}", lambda path: _lost(path / data, policies) is None)
 
 
 def keep_others(file: Path, policies: Sequence[str] = ()) -> None:
@@ -90,14 +90,7 @@ def _lost(file: Path, policies: Sequence[str] = ()) -> str | None:
 
 def _asked(arguments: Sequence[str]) -> list[str]:
     """Return arguments without those that change no result."""
-    words = iter(arguments)
-    found = []
-    for word in words:
-        if word in ("--out", "--threads"):
-            next(words, None)
-        elif word != "--json" and not word.startswith(("--out=", "--threads=")):
-            found.append(word)
-    return found
+    return [word for word in without_options(arguments, "--out", "--threads") if word != "--json"]
 
 
 def show_turn(display: ProgressDisplay, turn: Turn) -> None:
@@ -171,8 +164,7 @@ def make_study(
         name: of the study: its page is ``<name>.html``, its folder by default ``results/<name>-<policies>``.
     """
     files = found_policies(policy_files(request.policies))
-    usual = Path("results") / f"{name}-{joined_names(request.policies)}"
-    folder = out or free_folder(usual, lambda path: _lost(path / data, files) is None)
+    folder = study_folder(name, data, out=out, of=joined_names(request.policies), policies=files)
     request = replace(request, policies=policy_files(request.policies))
     results = study_in(folder, name, title, study, show, request, data=data, json_output=json_output, policies=files)
     errors = Terminal(stderr=True)

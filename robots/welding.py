@@ -36,13 +36,14 @@ def welded(robot: Robot, folder: Path, held: Sequence[str] = ()) -> Robot:
     rigid = set(robot.joint_names) - set(driven) - set(held)
     for tie in [each for each in spec.equalities if each.type == mujoco.mjtEq.mjEQ_JOINT]:
         tied = {name for name in (tie.name1, tie.name2) if name}
-        if loose := tied - rigid if tied & rigid else set():
+        if tied.isdisjoint(rigid):
+            continue
+        if loose := tied - rigid:
             raise RobotError(
                 f"robot '{robot.name}': the joint '{min(tied & rigid)}' cannot be made rigid, since an equality ties it to "
                 f"'{min(loose)}'; drive both, or hold both"
             )
-        if tied & rigid:
-            spec.delete(tie)
+        spec.delete(tie)
     for name in rigid:
         body = spec.joint(name).parent
         if any(joint.name in driven for joint in body.joints):

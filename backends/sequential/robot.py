@@ -140,7 +140,8 @@ def read_robot(scene: Scene) -> RobotModel:
     """
     robot, model = scene.robot, robot_spec(scene).compile()
     unknown = {"springs in its joints": model.jnt_stiffness.any(), "equalities": model.neq, "tendons": model.ntendon}
-    for what in (words for words, there in unknown.items() if there):
+    if found := [words for words, there in unknown.items() if there]:
+        what = " and ".join(found)
         raise BackendError(
             f"robot '{robot.name}' has {what}, which this engine does not simulate; use --backend mujoco"
         )

@@ -46,6 +46,7 @@ def _render(run: Path, scores: str | None, scalars: Mapping[str, float]) -> str:
     result = None if folder is None else read_result(folder / "results.json", CheckpointError)
     films = {film: _FILM.fullmatch(film.stem) for film in sorted((run / VIDEO_FOLDER).glob("*.mp4"))}
     shown = [(int(name["iteration"]), name["terrain"], film) for film, name in films.items() if name]
+    last = max((iteration for iteration, *_ in shown), default=0)
     described = read_run_json(run)
     schedule = described.get("settings", {}).get("environment", {}).get("schedule", {})
     return page_template(__file__, "training.html.j2", terrain=charts.terrain_label).render(
@@ -60,7 +61,7 @@ def _render(run: Path, scores: str | None, scalars: Mapping[str, float]) -> str:
         films=[
             (terrain, base64.b64encode(film.read_bytes()).decode())
             for iteration, terrain, film in shown
-            if iteration == max(shown)[0]
+            if iteration == last
         ],
     )
 
